@@ -1,0 +1,1 @@
+"""Regularizers for grid radiance fields, attached from the outside."""
