@@ -1,0 +1,204 @@
+"""From appearance features, direction and position to colour: the ``S`` of TensoRF (section 4.1)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from gridreg.encodings import octaves_of_channels, positional_encoding
+from gridreg.sites import Site, inputs, parameters
+
+__all__ = ["DECODERS", "MLPDecoder", "RGBDecoder", "SHDecoder", "make_decoder"]
+
+
+class MLPDecoder(nn.Module):
+    """An MLP ``width-width-3`` on features, direction and position, each with its positional encoding.
+
+    The columns of the first weight are ``[features | direction | position]``, each block ordered octave by octave, so a
+    mask on an encoding is a mask on columns of that weight: the same function, at the cost of a small matrix.
+
+    Args:
+        features: appearance features ``F`` (27 in TensoRF).
+        feature_octaves, direction_octaves: octaves of the encodings (2 and 2 for ``MLP_Fea``).
+        position_octaves: octaves of the position's encoding; None leaves the position out.
+        width: hidden width.
+    """
+
+    def __init__(
+        self,
+        features: int = 27,
+        *,
+        feature_octaves: int = 2,
+        direction_octaves: int = 2,
+        position_octaves: int | None = None,
+        width: int = 128,
+    ) -> None:
+        super().__init__()
+        self.features = features
+        self.feature_octaves = feature_octaves
+        self.direction_octaves = direction_octaves
+        self.position_octaves = position_octaves
+        self.layers = nn.ModuleList(
+            [nn.Linear(sum(self.block_sizes), width), nn.Linear(width, width), nn.Linear(width, 3)]
+        )
+        nn.init.zeros_(self.layers[2].bias)  # type: ignore[arg-type]
+
+    @property
+    def block_sizes(self) -> tuple[int, int, int]:
+        """Input columns of features, direction and position."""
+        position = 0 if self.position_octaves is None else 3 * (1 + 2 * self.position_octaves)
+        return (self.features * (1 + 2 * self.feature_octaves), 3 * (1 + 2 * self.direction_octaves), position)
+
+    def forward(
+        self, features: Tensor, directions: Tensor, positions: Tensor, ray_indices: Tensor | None = None
+    ) -> Tensor:
+        """Colours ``(N, 3)`` in (0, 1).
+
+        Args:
+            features: ``(N, F)``.
+            directions: ``(N, 3)``, or ``(R, 3)`` with ``ray_indices``.
+            positions: ``(N, 3)`` normalised to [-1, 1].
+            ray_indices: ``(N,)``: the ray of each sample; its direction is then encoded once per ray.
+        """
+        first, second, last = self.layers
+        weight = first.weight
+        of_features, of_direction, _ = self.block_sizes
+        encoded = positional_encoding(features, self.feature_octaves)
+        if self.position_octaves is not None:
+            encoded = torch.cat([encoded, positional_encoding(positions, self.position_octaves)], dim=-1)
+            columns = torch.cat([weight[:, :of_features], weight[:, of_features + of_direction :]], dim=-1)
+        else:
+            columns = weight[:, :of_features]
+        by_direction = F.linear(
+            positional_encoding(directions, self.direction_octaves),
+            weight[:, of_features : of_features + of_direction],
+            first.bias,  # type: ignore[arg-type]
+        )
+        if ray_indices is not None:
+            by_direction = by_direction[ray_indices]
+        hidden = torch.relu(F.linear(encoded, columns) + by_direction)
+        return torch.sigmoid(last(torch.relu(second(hidden))))  # type: ignore[no-any-return]
+
+    def sites(self, prefix: str) -> dict[str, Site]:
+        """The encodings' sites: columns of the first weight, each with its octave."""
+        found, start = {}, 0
+        octaves = (self.feature_octaves, self.direction_octaves, self.position_octaves or 0)
+        for name, size, width, count in zip(
+            ("features", "direction", "position"), self.block_sizes, (self.features, 3, 3), octaves, strict=True
+        ):
+            if size:
+                selector = parameters(
+                    f"{prefix}.layers.0.weight",
+                    dim=1,
+                    channels=slice(start, start + size),
+                    octaves=octaves_of_channels(width, count),
+                )
+                found[f"encoding.{name}"] = Site(mask=selector)
+            start += size
+        return found
+
+
+class SHDecoder(nn.Module):
+    """Spherical harmonics of degree 2 with 9 coefficients per colour (PlenOctrees section 3; TensoRF "SH")."""
+
+    bands = 3
+
+    def __init__(self, features: int = 27) -> None:
+        super().__init__()
+        if features != 3 * self.bands**2:
+            raise ValueError(f"features={features}: spherical harmonics of degree 2 need {3 * self.bands**2}")
+
+    def forward(
+        self, features: Tensor, directions: Tensor, positions: Tensor, ray_indices: Tensor | None = None
+    ) -> Tensor:
+        """Colours ``(N, 3)``; see `MLPDecoder.forward` for the arguments."""
+        basis = spherical_harmonics(directions)
+        if ray_indices is not None:
+            basis = basis[ray_indices]
+        return torch.relu((features.reshape(-1, 3, basis.shape[-1]) * basis[:, None, :]).sum(dim=-1) + 0.5)
+
+    def sites(self, prefix: str) -> dict[str, Site]:
+        """The coefficients, with the band (degree) of each as its octave."""
+        bands = [band for _ in range(3) for band in range(self.bands) for _ in range(2 * band + 1)]
+        return {"view": Site(mask=inputs(prefix, octaves=bands))}
+
+
+class RGBDecoder(nn.Module):
+    """The features are the colour: three of them, through a sigmoid. No dependence on the direction."""
+
+    def __init__(self, features: int = 3) -> None:
+        super().__init__()
+        if features != 3:
+            raise ValueError(f"features={features}: the RGB decoder needs 3")
+
+    def forward(
+        self, features: Tensor, directions: Tensor, positions: Tensor, ray_indices: Tensor | None = None
+    ) -> Tensor:
+        """Colours ``(N, 3)``; see `MLPDecoder.forward` for the arguments."""
+        return torch.sigmoid(features)
+
+    def sites(self, prefix: str) -> dict[str, Site]:
+        """None: there is nothing to mask."""
+        return {}
+
+
+def spherical_harmonics(directions: Tensor) -> Tensor:
+    """The 9 real spherical harmonics up to degree 2 of unit directions ``(N, 3)``, as ``(N, 9)``."""
+    x, y, z = directions.unbind(-1)
+    one = math.sqrt(3 / (4 * math.pi))
+    two = math.sqrt(15 / (4 * math.pi))
+    return torch.stack(
+        [
+            torch.full_like(x, 0.5 / math.sqrt(math.pi)),
+            -one * y,
+            one * z,
+            -one * x,
+            two * x * y,
+            -two * y * z,
+            0.25 * math.sqrt(5 / math.pi) * (3 * z * z - 1),
+            -two * x * z,
+            0.5 * two * (x * x - y * y),
+        ],
+        dim=-1,
+    )
+
+
+def _mlp(feature: int, direction: int, position: int | None) -> Callable[[int, int], nn.Module]:
+    def make(features: int, width: int) -> nn.Module:
+        return MLPDecoder(
+            features, feature_octaves=feature, direction_octaves=direction, position_octaves=position, width=width
+        )
+
+    return make
+
+
+#: Decoders by name: (default features, constructor from features and width).
+DECODERS: dict[str, tuple[int, Callable[[int, int], nn.Module]]] = {
+    "mlp_fea": (27, _mlp(2, 2, None)),
+    "mlp_pe": (27, _mlp(0, 2, 6)),
+    "mlp": (27, _mlp(2, 6, 6)),
+    "sh": (27, lambda features, width: SHDecoder(features)),
+    "rgb": (3, lambda features, width: RGBDecoder(features)),
+}
+
+
+def make_decoder(name: str, features: int | None = None, width: int = 128) -> tuple[int, nn.Module]:
+    """A decoder by name, and the number of features it reads.
+
+    Args:
+        name: ``mlp_fea`` (TensoRF MLP_Fea), ``mlp_pe`` (MLP_PE), ``mlp`` (Few TensoRF: position 6, direction 6, feature 2
+            octaves), ``sh`` or ``rgb``.
+
+    Raises:
+        ValueError: for an unknown name.
+    """
+    if name not in DECODERS:
+        raise ValueError(f"decoder={name!r}: unknown; expected one of {', '.join(sorted(DECODERS))}")
+    default, make = DECODERS[name]
+    count = default if features is None else features
+    return count, make(count, width)
+

@@ -1,0 +1,180 @@
+"""What VM- and CP-TensoRF share: a box, a density activation, a basis and a decoder."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from backbones.decoders import make_decoder
+from gridreg.sites import Site
+
+__all__ = ["TensorialField", "density_shift_for", "resolution_of"]
+
+
+def density_shift_for(opacity: float, length: float, distance_scale: float) -> float:
+    """The shift at which a ray through an untrained field has a wanted opacity.
+
+    With features near 0, ``distance_scale * softplus(shift)`` must be ``-log(1 - opacity) / length``. DVGO (section 4.1)
+    derives its shift from the opacity of a step; the opacity of a ray does not depend on the step.
+
+    Args:
+        opacity: in (0, 1).
+        length: of the ray inside the box, world units.
+        distance_scale: factor on the density.
+
+    Example:
+        >>> shift = density_shift_for(0.1, 3.0, 25.0)
+        >>> round(1 - math.exp(-25.0 * math.log1p(math.exp(shift)) * 3.0), 6)
+        0.1
+    """
+    if not 0 < opacity < 1:
+        raise ValueError(f"initial_opacity={opacity}: expected a number between 0 and 1, both excluded")
+    return math.log(math.expm1(-math.log1p(-opacity) / (length * distance_scale)))
+
+
+def resolution_of(voxels: float, bounds: Tensor) -> tuple[int, int, int]:
+    """Nodes along x, y, z of a grid with cubic cells and about ``voxels`` of them (TensoRF ``N_to_reso``).
+
+    Example:
+        >>> resolution_of(8e3, torch.tensor([[0., 0., 0.], [1., 1., 1.]]))
+        (20, 20, 20)
+    """
+    size = (bounds[1] - bounds[0]).double()
+    edge = float((size.prod() / voxels) ** (1 / 3))
+    x, y, z = (max(2, int(round(float(s) / edge, 6))) for s in size)
+    return x, y, z
+
+
+class TensorialField(nn.Module):
+    """``density = distance_scale * softplus(G(x) + shift)``, ``colour = S(B A(x), d)`` (TensoRF, section 4.1).
+
+    Subclasses own the grids: they give `density_features`, `appearance_features`, `resample` and `_crop`.
+
+    Args:
+        bounds: ``(2, 3)``, world units.
+        resolution: nodes along x, y, z.
+        appearance_channels: width of `appearance_features`.
+        decoder: name, see `backbones.decoders.make_decoder`.
+        features: decoder features; None for the decoder's own default.
+        density_shift: added before the softplus; -10 in TensoRF. None: from ``initial_opacity``.
+        initial_opacity: opacity of a ray along the mean edge of the box before training; used when there is no shift.
+        distance_scale: factor on the density (25 in TensoRF).
+    """
+
+    bounds: Tensor
+
+    def __init__(
+        self,
+        bounds: Tensor,
+        resolution: tuple[int, int, int],
+        appearance_channels: int,
+        *,
+        decoder: str = "mlp_fea",
+        features: int | None = None,
+        width: int = 128,
+        density_shift: float | None = -10.0,
+        initial_opacity: float = 0.1,
+        distance_scale: float = 25.0,
+    ) -> None:
+        super().__init__()
+        if tuple(bounds.shape) != (2, 3) or not bool((bounds[1] > bounds[0]).all()):
+            raise ValueError(f"bounds={bounds.tolist()}: expected a lower and a larger upper corner, shape (2, 3)")
+        if min(resolution) < 2:
+            raise ValueError(f"resolution={resolution}: expected at least 2 nodes along every axis")
+        self.register_buffer("bounds", bounds.clone().float())
+        self.resolution = resolution
+        count, self.decoder = make_decoder(decoder, features, width)
+        self.basis = nn.Linear(appearance_channels, count, bias=False)
+        self.distance_scale = distance_scale
+        if density_shift is None:
+            length = float((bounds[1] - bounds[0]).mean())
+            density_shift = density_shift_for(initial_opacity, length, distance_scale)
+        self.density_shift = density_shift
+
+    def normalise(self, x: Tensor) -> Tensor:
+        """World positions ``(N, 3)`` to [0, 1]^3 inside the box."""
+        return (x - self.bounds[0]) / (self.bounds[1] - self.bounds[0])
+
+    def density_features(self, u: Tensor) -> Tensor:
+        """Normalised positions ``(N, 3)`` to the scalar ``G(x)``, ``(N,)``."""
+        raise TypeError(f"{type(self).__name__} must define density_features")
+
+    def appearance_features(self, u: Tensor) -> Tensor:
+        """Normalised positions ``(N, 3)`` to components ``(N, C)``."""
+        raise TypeError(f"{type(self).__name__} must define appearance_features")
+
+    def activate(self, features: Tensor) -> Tensor:
+        """Density per world unit from density features."""
+        return self.distance_scale * F.softplus(features + self.density_shift)
+
+    def density(self, x: Tensor) -> Tensor:
+        """Density ``(N,)`` per world unit at world positions ``(N, 3)``; 0 outside the box."""
+        u = self.normalise(x)
+        inside = ((u >= 0) & (u <= 1)).all(dim=-1)
+        density = self.activate(self.density_features(u))
+        return torch.where(inside, density, torch.zeros_like(density))
+
+    def colour(self, x: Tensor, d: Tensor) -> Tensor:
+        """Colour ``(N, 3)`` at world positions ``(N, 3)`` seen along unit directions ``(N, 3)``."""
+        return self._colour(x, d, None)
+
+    def colour_of_rays(self, x: Tensor, directions: Tensor, ray_indices: Tensor) -> Tensor:
+        """Like `colour` with directions ``(R, 3)`` given per ray and the ray ``(N,)`` of each position."""
+        return self._colour(x, directions, ray_indices)
+
+    def _colour(self, x: Tensor, directions: Tensor, ray_indices: Tensor | None) -> Tensor:
+        u = self.normalise(x)
+        features = self.basis(self.appearance_features(u))
+        return self.decoder(features, directions, 2 * u - 1, ray_indices)  # type: ignore[no-any-return]
+
+    def voxel_size(self) -> float:
+        """Mean edge of a cell, world units."""
+        nodes = torch.tensor(self.resolution, device=self.bounds.device)
+        return float(((self.bounds[1] - self.bounds[0]) / (nodes - 1)).mean())
+
+    def shrink(self, bounds: Tensor) -> None:
+        """Crop to the nodes around a smaller box: inside it the field keeps its values exactly.
+
+        Args:
+            bounds: ``(2, 3)``, world units; the new box is the smallest one between nodes that holds it.
+        """
+        nodes = torch.tensor(self.resolution, device=self.bounds.device)
+        cell = (self.bounds[1] - self.bounds[0]).double() / (nodes - 1)
+        scaled = (bounds.double() - self.bounds[0].double()) / cell
+        # A corner a rounding error past a node belongs to that node.
+        lower = (scaled[0] + 1e-4).floor().long().clamp(min=0)
+        upper = torch.minimum((scaled[1] - 1e-4).ceil().long(), nodes - 1)
+        lower = torch.minimum(lower, upper - 1).clamp(min=0)
+        upper = torch.maximum(upper, lower + 1)
+        origin = self.bounds[0].double()
+        self._crop(lower.tolist(), (upper + 1).tolist())
+        self.bounds.copy_(torch.stack([origin + lower * cell, origin + upper * cell]).float())
+        x, y, z = (upper - lower + 1).tolist()
+        self.resolution = (x, y, z)
+
+    def _crop(self, start: list[int], stop: list[int]) -> None:
+        raise TypeError(f"{type(self).__name__} must define _crop")
+
+    def grid_parameters(self) -> list[nn.Parameter]:
+        """Planes and lines."""
+        networks = {id(p) for p in self.network_parameters()}
+        return [p for p in self.parameters() if id(p) not in networks]
+
+    def network_parameters(self) -> list[nn.Parameter]:
+        """Basis and decoder."""
+        return [*self.basis.parameters(), *self.decoder.parameters()]
+
+    def parameter_groups(self) -> list[dict[str, Any]]:
+        """Optimizer groups named ``grid`` and ``network``."""
+        return [
+            {"name": "grid", "params": self.grid_parameters()},
+            {"name": "network", "params": self.network_parameters()},
+        ]
+
+    def sites(self) -> dict[str, Site]:
+        """The encodings of the decoder; subclasses add their grids."""
+        return self.decoder.sites("decoder")  # type: ignore[operator, no-any-return]

@@ -1,0 +1,112 @@
+"""VM-TensoRF: planes times lines (Chen et al., TensoRF, ECCV 2022, equations 3 and 10)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from backbones import kernels
+from backbones.tensorial import TensorialField
+from gridreg.sites import Site, open_channels, parameters
+
+__all__ = ["LINE_AXES", "PLANE_AXES", "VMField"]
+
+PLANE_AXES = ((0, 1), (0, 2), (1, 2))
+LINE_AXES = (2, 1, 0)
+
+
+class VMField(TensorialField):
+    """A radiance field factored into three plane-line pairs.
+
+    ``G(x) = sum_k sum_c plane_k[x_a, x_b, c] * line_k[x_v, c]``; for appearance the products are concatenated.
+    Grids are channels-last: planes ``(A, B, C)``, lines ``(M, C)``.
+
+    Args:
+        bounds: ``(2, 3)``, world units.
+        resolution: nodes along x, y, z.
+        density_components, appearance_components: channels ``C`` of each plane-line pair (16 and 48 in TensoRF).
+        scale: standard deviation of the initial values.
+        generator: for the initial values.
+        options: of `TensorialField`.
+    """
+
+    def __init__(
+        self,
+        bounds: Tensor,
+        resolution: tuple[int, int, int],
+        *,
+        density_components: int = 16,
+        appearance_components: int = 48,
+        scale: float = 0.1,
+        generator: torch.Generator | None = None,
+        **options: Any,
+    ) -> None:
+        super().__init__(bounds, resolution, 3 * appearance_components, **options)
+        self.density_planes, self.density_lines = _grids(resolution, density_components, scale, generator)
+        self.appearance_planes, self.appearance_lines = _grids(resolution, appearance_components, scale, generator)
+
+    def density_features(self, u: Tensor) -> Tensor:
+        """``G(x)``: normalised positions ``(N, 3)`` to ``(N,)``."""
+        return kernels.vm_density(
+            u, list(self.density_planes), list(self.density_lines), open_channels(self.density_lines, "0")
+        )
+
+    def appearance_features(self, u: Tensor) -> Tensor:
+        """Normalised positions ``(N, 3)`` to the concatenated products ``(N, 3 C)``."""
+        return kernels.vm_features(
+            u, list(self.appearance_planes), list(self.appearance_lines), open_channels(self.appearance_lines, "0")
+        )
+
+    @torch.no_grad()
+    def resample(self, resolution: tuple[int, int, int]) -> None:
+        """Replace every grid by its (bi)linear interpolation at new nodes; the corners stay where they are."""
+        for planes, lines in self._pairs():
+            for k in range(3):
+                a, b = PLANE_AXES[k]
+                planes[k] = nn.Parameter(_resampled(planes[k], (resolution[a], resolution[b])))
+                lines[k] = nn.Parameter(_resampled(lines[k], (resolution[LINE_AXES[k]],)))
+        self.resolution = resolution
+
+    @torch.no_grad()
+    def _crop(self, start: list[int], stop: list[int]) -> None:
+        for planes, lines in self._pairs():
+            for k in range(3):
+                (a, b), v = PLANE_AXES[k], LINE_AXES[k]
+                plane = planes[k][start[a] : stop[a], start[b] : stop[b]]
+                planes[k] = nn.Parameter(plane.clone(memory_format=torch.contiguous_format))
+                lines[k] = nn.Parameter(lines[k][start[v] : stop[v]].clone())
+
+    def _pairs(self) -> tuple[tuple[nn.ParameterList, nn.ParameterList], ...]:
+        return (self.density_planes, self.density_lines), (self.appearance_planes, self.appearance_lines)
+
+    def sites(self) -> dict[str, Site]:
+        """``density``, ``appearance`` (masks act on their lines), each also ``.planes`` and ``.lines``; encodings."""
+        found = super().sites()
+        for kind in ("density", "appearance"):
+            planes = parameters(f"{kind}_planes.*", dim=-1)
+            lines = parameters(f"{kind}_lines.*", dim=-1)
+            found[kind] = Site(mask=lines, grids=(planes, lines))
+            found[f"{kind}.planes"] = Site(mask=planes, grids=(planes,))
+            found[f"{kind}.lines"] = Site(mask=lines, grids=(lines,))
+        return found
+
+
+def _grids(
+    resolution: tuple[int, int, int], channels: int, scale: float, generator: torch.Generator | None
+) -> tuple[nn.ParameterList, nn.ParameterList]:
+    planes, lines = nn.ParameterList(), nn.ParameterList()
+    for (a, b), v in zip(PLANE_AXES, LINE_AXES, strict=True):
+        planes.append(nn.Parameter(scale * torch.randn(resolution[a], resolution[b], channels, generator=generator)))
+        lines.append(nn.Parameter(scale * torch.randn(resolution[v], channels, generator=generator)))
+    return planes, lines
+
+
+def _resampled(grid: Tensor, size: tuple[int, ...]) -> Tensor:
+    """Linear interpolation of a channels-last grid, corner to corner."""
+    channels_first = grid.movedim(-1, 0)[None]
+    mode = "bilinear" if len(size) == 2 else "linear"
+    out = F.interpolate(channels_first, size=size, mode=mode, align_corners=True)[0]
+    return out.movedim(0, -1).contiguous()

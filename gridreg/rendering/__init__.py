@@ -1,0 +1,21 @@
+"""Rays in, pixels out: box intersection, occupancy, march and compositing."""
+
+from gridreg.rendering.occupancy import OccupancyGrid, visual_hull
+from gridreg.rendering.rays import Rays, box_intersection, camera_rays, pixel_rays
+from gridreg.rendering.render import Field, March, Rendered, SampleHook, composite, render_image, render_rays
+
+__all__ = [
+    "Field",
+    "March",
+    "OccupancyGrid",
+    "Rays",
+    "Rendered",
+    "SampleHook",
+    "box_intersection",
+    "camera_rays",
+    "composite",
+    "pixel_rays",
+    "render_image",
+    "render_rays",
+    "visual_hull",
+]

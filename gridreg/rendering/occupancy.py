@@ -1,0 +1,202 @@
+"""Which cells of the box may hold something: the march skips all others."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+__all__ = ["OccupancyGrid", "visual_hull"]
+
+Density = Callable[[Tensor], Tensor]
+
+
+@dataclass
+class OccupancyGrid:
+    """A box cut into cells, each occupied (1) or empty (0).
+
+    Args:
+        bounds: ``(2, 3)`` lower and upper corner of the box, world units.
+        cells: ``(X, Y, Z)`` uint8. Cell ``(i, j, k)`` covers ``[i, i + 1) / X`` of the box along x, and so on.
+        hull: cells that may ever be occupied, ``(X, Y, Z)`` uint8 or None; see `visual_hull`.
+    """
+
+    bounds: Tensor
+    cells: Tensor
+    hull: Tensor | None = None
+
+    @classmethod
+    def full(cls, bounds: Tensor, resolution: tuple[int, int, int]) -> OccupancyGrid:
+        """A grid with every cell occupied."""
+        return cls(bounds.clone(), torch.ones(resolution, dtype=torch.uint8, device=bounds.device))
+
+    @property
+    def resolution(self) -> tuple[int, int, int]:
+        """Cells along x, y, z."""
+        x, y, z = self.cells.shape
+        return x, y, z
+
+    @property
+    def fraction(self) -> float:
+        """Occupied share of the cells, in [0, 1]."""
+        return float(self.cells.float().mean())
+
+    def centres(self, index: Tensor) -> Tensor:
+        """World positions ``(M, 3)`` of the centres of cells given by flat index ``(M,)``."""
+        x, y, z = self.resolution
+        ijk = torch.stack([index // (y * z), index // z % y, index % z], dim=-1)
+        size = torch.tensor([x, y, z], device=index.device)
+        unit = (ijk.to(self.bounds.dtype) + 0.5) / size
+        return self.bounds[0] + unit * (self.bounds[1] - self.bounds[0])
+
+    @torch.no_grad()
+    def update(
+        self, density: Density, step: float, *, threshold: float = 1e-4, dilate: int = 1, chunk: int = 1 << 18
+    ) -> None:
+        """Keep the cells whose opacity over one ray step exceeds a bound, and their neighbours.
+
+        Only cells that are occupied now are evaluated, at their centres (TensoRF section 4, "alpha mask": occupied
+        where ``1 - exp(-density * step) > 1e-4``, dilated by a 3^3 maximum).
+
+        Args:
+            density: positions ``(N, 3)`` to densities ``(N,)`` per world unit.
+            step: length of a ray step, world units.
+            threshold: bound on the opacity, in [0, 1].
+            dilate: cells by which the result grows in every direction.
+            chunk: positions evaluated at once.
+        """
+        occupied = self.cells.reshape(-1).nonzero().squeeze(-1)
+        bound = -math.log1p(-threshold) / step
+        kept = torch.zeros(self.cells.numel(), dtype=torch.uint8, device=self.cells.device)
+        for part in occupied.split(chunk):
+            kept[part] = (density(self.centres(part)) > bound).to(torch.uint8)
+        grown = _dilate(kept.reshape(self.cells.shape), dilate)
+        self.cells = grown if self.hull is None else grown * self.hull
+
+    def at(self, bounds: Tensor, resolution: tuple[int, int, int]) -> OccupancyGrid:
+        """The same occupancy on another box and resolution: a cell is occupied if any cell it overlaps was."""
+        cells = _resized(self.cells, self.bounds, bounds, resolution)
+        hull = None if self.hull is None else _resized(self.hull, self.bounds, bounds, resolution)
+        return OccupancyGrid(bounds.clone(), cells, hull)
+
+    def tight_bounds(self) -> Tensor:
+        """The smallest box ``(2, 3)`` that holds every occupied cell.
+
+        Raises:
+            RuntimeError: if no cell is occupied.
+        """
+        if not bool(self.cells.any()):
+            raise RuntimeError("occupancy: no cell is occupied, so there is no box around them")
+        size = (self.bounds[1] - self.bounds[0]) / torch.tensor(self.resolution, device=self.bounds.device)
+        ranges = [self.cells.amax(dim=tuple(b for b in range(3) if b != a)).nonzero() for a in range(3)]
+        lower = torch.stack([r.min() for r in ranges])
+        upper = torch.stack([r.max() + 1 for r in ranges])
+        return torch.stack([self.bounds[0] + lower * size, self.bounds[0] + upper * size])
+
+    def contains(self, positions: Tensor) -> Tensor:
+        """Whether each position ``(N, 3)`` lies in an occupied cell: ``(N,)`` bool."""
+        size = torch.tensor(self.resolution, device=positions.device)
+        unit = (positions - self.bounds[0]) / (self.bounds[1] - self.bounds[0])
+        inside = ((unit >= 0) & (unit <= 1)).all(dim=-1)
+        ijk = torch.minimum((unit.clamp(0, 1) * size).long(), size - 1)
+        return inside & self.cells[ijk[:, 0], ijk[:, 1], ijk[:, 2]].bool()
+
+
+def _dilate(cells: Tensor, radius: int) -> Tensor:
+    if radius == 0:
+        return cells
+    grown = F.max_pool3d(cells[None, None].float(), 2 * radius + 1, stride=1, padding=radius)
+    return grown[0, 0].to(torch.uint8)
+
+
+def _resized(cells: Tensor, old: Tensor, new: Tensor, resolution: tuple[int, int, int]) -> Tensor:
+    """Per axis, the range of old cells under each new cell, reduced by maximum."""
+    out = cells
+    for axis in range(3):
+        count, target = cells.shape[axis], resolution[axis]
+        edges = torch.linspace(0, 1, target + 1, dtype=torch.float64, device=cells.device)
+        world = new[0, axis].double() + edges * (new[1, axis] - new[0, axis]).double()
+        scaled = (world - old[0, axis].double()) / (old[1, axis] - old[0, axis]).double() * count
+        first = (scaled[:-1] + 1e-6).floor().long().clamp(0, count - 1)
+        last = ((scaled[1:] - 1e-6).ceil().long() - 1).clamp(0, count - 1)
+        outside = (scaled[1:] <= 1e-6) | (scaled[:-1] >= count - 1e-6)
+        # A running count along the axis answers "any occupied between first and last" in two look-ups.
+        total = F.pad(out.long().cumsum(dim=axis), _pad_front(axis))
+        any_inside = total.index_select(axis, last + 1) - total.index_select(axis, first) > 0
+        shape = [1, 1, 1]
+        shape[axis] = target
+        out = (any_inside & ~outside.view(shape)).to(torch.uint8)
+    return out
+
+
+def _pad_front(axis: int) -> list[int]:
+    pad = [0] * 6
+    pad[2 * (2 - axis)] = 1
+    return pad
+
+
+def _footprint(total: Tensor, row: Tensor, column: Tensor, radius: Tensor) -> Tensor:
+    """Number of marked pixels within a square around each pixel, from a summed-area table ``(H + 1, W + 1)``."""
+    height, width = total.shape[0] - 1, total.shape[1] - 1
+    top = (row - radius).floor().long().clamp(0, height)
+    bottom = ((row + radius).floor().long() + 1).clamp(0, height)
+    left = (column - radius).floor().long().clamp(0, width)
+    right = ((column + radius).floor().long() + 1).clamp(0, width)
+    return total[bottom, right] - total[top, right] - total[bottom, left] + total[top, left]
+
+
+def _alpha_views(alpha: Tensor, poses: Tensor, intrinsics: Tensor) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    for mask, pose, camera in zip(alpha, poses, intrinsics, strict=True):
+        total = F.pad((mask > 0).long().cumsum(0).cumsum(1), (1, 0, 1, 0))
+        yield total, torch.linalg.inv(pose.double()), camera.double()
+
+
+@torch.no_grad()
+def visual_hull(
+    grid: OccupancyGrid, alpha: Tensor, poses: Tensor, intrinsics: Tensor, *, margin: float = 1.0, chunk: int = 1 << 18
+) -> Tensor:
+    """Cells that no view proves empty: space carving from silhouettes (Laurentini 1994).
+
+    A cell is carved when its whole projection, plus a margin, falls on pixels with alpha 0 in some view. What a view does
+    not see (outside the picture, behind the camera) it does not carve.
+
+    Args:
+        grid: box and resolution.
+        alpha: ``(V, H, W)`` in [0, 1].
+        poses: ``(V, 4, 4)`` camera-to-world.
+        intrinsics: ``(V, 4)`` fx, fy, cx, cy in pixels.
+        margin: pixels added around each projection.
+
+    Returns:
+        ``(X, Y, Z)`` uint8, 1 where something may be.
+    """
+    height, width = alpha.shape[1:]
+    resolution = torch.tensor(grid.resolution, device=grid.bounds.device)
+    radius = float(((grid.bounds[1] - grid.bounds[0]) / resolution).norm()) / 2
+    kept = torch.arange(grid.cells.numel(), device=alpha.device)
+    for total, world_to_camera, (fx, fy, cx, cy) in _alpha_views(alpha, poses, intrinsics):
+        survivors = []
+        for part in kept.split(chunk):
+            local = grid.centres(part).double() @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
+            depth = -local[:, 2]
+            safe = (depth - radius).clamp(min=1e-6)
+            column, row = cx + fx * local[:, 0] / depth, cy - fy * local[:, 1] / depth
+            pixels = radius * torch.maximum(fx, fy) * (1 + (local[:, :2] / safe[:, None]).norm(dim=-1)) / safe + margin
+            seen_whole = (
+                (depth > radius)
+                & (column - pixels >= 0)
+                & (column + pixels <= width)
+                & (row - pixels >= 0)
+                & (row + pixels <= height)
+            )
+            pixels = pixels.clamp(max=float(max(height, width)))
+            empty = seen_whole & (_footprint(total, row.nan_to_num(0), column.nan_to_num(0), pixels) == 0)
+            survivors.append(part[~empty])
+        kept = torch.cat(survivors)
+    hull = torch.zeros(grid.cells.numel(), dtype=torch.uint8, device=alpha.device)
+    hull[kept] = 1
+    return hull.reshape(grid.cells.shape)

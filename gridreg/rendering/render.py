@@ -1,0 +1,194 @@
+"""Samples in, colours out: emission-absorption volume rendering of any field (Max 1995; NeRF equation 3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from gridreg.rendering import backends
+from gridreg.rendering.occupancy import OccupancyGrid
+from gridreg.rendering.rays import Rays, box_intersection, camera_rays
+from gridreg.samples import RaySamples
+
+__all__ = ["Field", "March", "Rendered", "SampleHook", "render_image", "render_rays"]
+
+
+class Field(Protocol):
+    """What the renderer asks of a field; a field may also offer `march_density` and `colour_of_rays`."""
+
+    bounds: Tensor
+
+    def density(self, x: Tensor, /) -> Tensor:
+        """Positions ``(N, 3)`` to densities ``(N,)`` per world unit."""
+        ...
+
+    def colour(self, x: Tensor, d: Tensor, /) -> Tensor:
+        """Positions and directions ``(N, 3)`` to colours ``(N, 3)`` in [0, 1]."""
+        ...
+
+
+class SampleHook(Protocol):
+    """What may change samples between the field and the compositing: a `gridreg.Handle`."""
+
+    def on_samples(self, samples: RaySamples, /) -> RaySamples:
+        """The samples, perhaps with scaled gradients."""
+        ...
+
+
+@dataclass(frozen=True)
+class March:
+    """How rays are walked.
+
+    Args:
+        step: distance between samples, world units.
+        near, far: the part of each ray that counts, world units.
+        transmittance_bound: samples behind this transmittance are dropped, unitless; the colour of a pixel
+            changes by at most this much. 0 keeps them all.
+        weight_bound: colour is evaluated only where the weight exceeds this (TensoRF uses 1e-4).
+    """
+
+    step: float
+    near: float = 0.0
+    far: float = 1e10
+    transmittance_bound: float = 1e-4
+    weight_bound: float = 1e-4
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """Pixels of ``R`` rays.
+
+    Args:
+        colour: ``(R, 3)`` on the background.
+        opacity: ``(R,)`` in [0, 1].
+        depth: ``(R,)`` weighted mean distance times opacity, world units (0 where nothing was hit).
+        samples: the samples behind them; None for whole images.
+    """
+
+    colour: Tensor
+    opacity: Tensor
+    depth: Tensor
+    samples: RaySamples | None = None
+
+
+def _march(
+    field: Any, rays: Rays, occupancy: OccupancyGrid, march: March, jitter: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Offsets, index, t, positions and density of the samples that are not hidden."""
+    t_min, t_max = box_intersection(rays, field.bounds, march.near, march.far)
+    fused = getattr(field, "march_density", None)
+    if fused is not None:
+        found: tuple[Tensor, Tensor, Tensor, Tensor, Tensor] = fused(
+            rays, t_min, t_max, march.step, occupancy, jitter, march.transmittance_bound
+        )
+        return found
+    offsets, index, t, positions = backends.march(
+        rays.origins, rays.directions, t_min, t_max, march.step, occupancy.cells, occupancy.bounds, jitter
+    )
+    density = field.density(positions)
+    if march.transmittance_bound > 0:
+        kept = backends.terminate(density.detach() * march.step, offsets, march.transmittance_bound)
+        offsets = _offsets_of(kept, offsets)
+        index, t, positions, density = index[kept], t[kept], positions[kept], density[kept]
+    return offsets, index, t, positions, density
+
+
+def _offsets_of(kept: Tensor, offsets: Tensor) -> Tensor:
+    running = torch.zeros(kept.shape[0] + 1, dtype=torch.int64, device=kept.device)
+    torch.cumsum(kept, 0, out=running[1:])
+    return running[offsets]
+
+
+def _colours(field: Any, positions: Tensor, rays: Rays, ray_indices: Tensor) -> Tensor:
+    by_ray = getattr(field, "colour_of_rays", None)
+    if by_ray is not None:
+        colours: Tensor = by_ray(positions, rays.directions, ray_indices)
+        return colours
+    return field.colour(positions, rays.directions[ray_indices])  # type: ignore[no-any-return]
+
+
+def render_rays(
+    field: Any,
+    rays: Rays,
+    occupancy: OccupancyGrid,
+    march: March,
+    *,
+    background: Tensor,
+    jitter: Tensor | None = None,
+    hook: SampleHook | None = None,
+) -> Rendered:
+    """Render a batch of rays, differentiably in the field's parameters.
+
+    Args:
+        field: a `Field`.
+        rays: ``R`` rays.
+        occupancy: cells that may hold something; samples elsewhere are skipped.
+        march: step and bounds.
+        background: colour behind the field, ``(3,)`` or ``(R, 3)``.
+        jitter: ``(R,)`` in [0, 1), the share of a step by which each ray's samples are shifted; None: 0.5.
+        hook: gets the samples before they are composited.
+    """
+    if jitter is None:
+        jitter = torch.full((len(rays),), 0.5, dtype=rays.origins.dtype, device=rays.origins.device)
+    offsets, index, t, positions, density = _march(field, rays, occupancy, march, jitter)
+    delta = torch.full_like(t, march.step)
+    samples = RaySamples(
+        offsets=offsets,
+        t=t,
+        delta=delta,
+        index=index,
+        density=density,
+        weights=backends.composite_weights(density * march.step, offsets),
+        positions=positions,
+        directions=rays.directions,
+    )
+    visible = samples.weights.detach() > march.weight_bound
+    chosen = visible.nonzero().squeeze(-1)
+    seen_colours = _colours(field, positions[chosen], rays, samples.ray_indices[chosen])
+    colours = torch.zeros_like(positions).index_put((chosen,), seen_colours)
+    samples = samples.replace(colours=colours, background=background.expand(len(rays), 3))
+    if hook is not None:
+        samples = hook.on_samples(samples)
+    return composite(samples)
+
+
+def composite(samples: RaySamples) -> Rendered:
+    """Pixels from samples: ``sum w c + (1 - sum w) background``."""
+    stacked = torch.cat([samples.colours, samples.t[:, None], torch.ones_like(samples.t[:, None])], dim=-1)
+    total = backends.accumulate(samples.weights, stacked, samples.offsets)
+    opacity = total[:, 4]
+    colour = total[:, :3] + (1 - opacity)[:, None] * samples.background
+    return Rendered(colour, opacity, total[:, 3], samples)
+
+
+@torch.no_grad()
+def render_image(
+    field: Any,
+    pose: Tensor,
+    intrinsics: Tensor,
+    height: int,
+    width: int,
+    occupancy: OccupancyGrid,
+    march: March,
+    *,
+    background: Tensor,
+    chunk: int = 1 << 14,
+) -> Rendered:
+    """Render one picture; the result does not depend on ``chunk``.
+
+    Returns:
+        colour ``(H, W, 3)`` clamped to [0, 1], opacity and depth ``(H, W)``.
+    """
+    rays = camera_rays(pose, intrinsics, height, width)
+    parts = [
+        render_rays(field, rays[start : start + chunk], occupancy, march, background=background)
+        for start in range(0, len(rays), chunk)
+    ]
+    return Rendered(
+        torch.cat([p.colour for p in parts]).clamp(0, 1).reshape(height, width, 3),
+        torch.cat([p.opacity for p in parts]).reshape(height, width),
+        torch.cat([p.depth for p in parts]).reshape(height, width),
+    )
