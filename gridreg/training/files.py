@@ -1,0 +1,166 @@
+"""Files that are whole or not there: written beside their name, then renamed over it.
+
+A run may be killed at any moment and a disk may fill up at any byte. Every function here leaves what stood
+under the name untouched until the new content is complete (POSIX ``rename`` replaces a file in one step),
+takes its temporary file away when something fails, and turns the ``OSError`` of an unwritable place into a
+one-line ``InputError``.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import secrets
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from gridreg.errors import InputError
+
+__all__ = [
+    "check_output_folder",
+    "output_errors",
+    "remove_folder",
+    "write_bytes",
+    "write_json",
+    "write_text",
+    "writing",
+]
+
+_REASONS = {
+    errno.ENOSPC: "no space left on the disk; free some or choose another place",
+    errno.EDQUOT: "the disk quota is used up; free some space or choose another place",
+    errno.EFBIG: "the file would exceed the largest size allowed here; choose another place",
+    errno.EACCES: "permission denied; choose a place that you may write to",
+    errno.EPERM: "not permitted; choose a place that you may write to",
+    errno.EROFS: "the file system is read-only; choose another place",
+    errno.EEXIST: "a file stands where a folder is expected; choose another name",
+    errno.ENOTDIR: "a file stands where a folder is expected; choose another name",
+    errno.EISDIR: "a folder stands where a file is expected; choose another name",
+    errno.ENAMETOOLONG: "the name is too long",
+}
+
+
+@contextmanager
+def output_errors(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Turn an ``OSError`` raised inside into one readable line that names ``path``.
+
+    Raises:
+        InputError: for any ``OSError`` (full disk, no permission, read-only, a file in the way, ...).
+    """
+    try:
+        yield
+    except OSError as error:
+        reason = _REASONS.get(error.errno or 0, error.strerror or str(error))
+        raise InputError(f"{os.fspath(path)}: cannot write here: {reason}") from error
+
+
+@contextmanager
+def writing(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """A temporary name beside ``path`` to write to; on leaving it takes the place of ``path``.
+
+    The temporary name keeps the suffix, because image and video writers choose the format by it. The content
+    is flushed to the disk before the rename, so a power failure leaves the old file or the new one. When the
+    block raises, the temporary file is removed and ``path`` stays as it was.
+
+    Raises:
+        InputError: if the place is not writable or the disk is full.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     with writing(Path(folder) / "a.txt") as temporary:
+        ...         _ = temporary.write_text("whole")
+        ...     (Path(folder) / "a.txt").read_text()
+        'whole'
+    """
+    path = Path(path)
+    # A token, not a fixed name: workers of one experiment may write the same file at the same time.
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}-{secrets.token_hex(4)}.tmp{path.suffix}")
+    with output_errors(path):
+        try:
+            yield temporary
+            _flush(temporary)
+            os.replace(temporary, path)
+        except BaseException:
+            temporary.unlink(missing_ok=True)
+            raise
+
+
+def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
+    """Write ``data`` to ``path``, whole or not at all.
+
+    Raises:
+        InputError: if the place is not writable or the disk is full.
+    """
+    with writing(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def write_text(path: str | os.PathLike[str], text: str) -> None:
+    """Write ``text`` to ``path`` in UTF-8, whole or not at all.
+
+    Raises:
+        InputError: if the place is not writable or the disk is full.
+    """
+    write_bytes(path, text.encode("utf-8"))
+
+
+def write_json(path: str | os.PathLike[str], value: Any, *, sort_keys: bool = True) -> None:
+    """Write ``value`` as indented JSON, keys sorted, whole or not at all.
+
+    Floats are written so that they read back bit for bit. JSON knows no infinity and no NaN; a caller that
+    has them turns them into text first (``gridreg.training.metrics.json_number``).
+
+    Raises:
+        InputError: if the place is not writable or the disk is full.
+        ValueError: if ``value`` holds an infinity or a NaN.
+        TypeError: if ``value`` holds something that JSON does not know.
+    """
+    text = json.dumps(value, indent=2, sort_keys=sort_keys, allow_nan=False, ensure_ascii=False)
+    write_text(path, text + "\n")
+
+
+def check_output_folder(path: str | os.PathLike[str]) -> Path:
+    """Create the folder if need be and prove that it can be written to, before hours of work depend on it.
+
+    Returns:
+        The folder as a ``Path``.
+
+    Raises:
+        InputError: if it is a file, cannot be created, or cannot be written to.
+    """
+    folder = Path(path)
+    with output_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        probe = folder / f".probe.{os.getpid()}-{secrets.token_hex(4)}.tmp"
+        try:
+            # Some bytes, because an empty file still fits on a full disk.
+            probe.write_bytes(b"\0" * 4096)
+        finally:
+            probe.unlink(missing_ok=True)
+    return folder
+
+
+def remove_folder(path: str | os.PathLike[str]) -> None:
+    """Remove a folder and what is in it; nothing happens if there is none.
+
+    Raises:
+        InputError: if it cannot be removed.
+    """
+    with output_errors(path):
+        try:
+            shutil.rmtree(path)
+        except FileNotFoundError:
+            return
+
+
+def _flush(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
