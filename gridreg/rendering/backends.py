@@ -1,0 +1,239 @@
+"""The inner loops of volume rendering behind names, with plain PyTorch versions that run on any device.
+
+Faster implementations register themselves under a name (`register_backend`); `use_backend` chooses. The plain
+versions are the reference: a registered one must return the same samples, and the same values up to rounding.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import TracebackType
+
+import torch
+from torch import Tensor
+
+from gridreg.errors import InputError
+from gridreg.rendering import plain
+
+__all__ = [
+    "Backend",
+    "accumulate",
+    "chosen_backend",
+    "composite_weights",
+    "march",
+    "register_backend",
+    "registered_backends",
+    "takes_compiled",
+    "terminate",
+    "use_backend",
+]
+
+Marched = tuple[Tensor, Tensor, Tensor, Tensor]
+
+
+@dataclass(frozen=True)
+class Backend:
+    """One implementation of the inner loops; signatures as of the functions of the same name."""
+
+    march: Callable[[Tensor, Tensor, Tensor, Tensor, float, Tensor, Tensor, Tensor | float], Marched]
+    composite_weights: Callable[[Tensor, Tensor], Tensor]
+    accumulate: Callable[[Tensor, Tensor, Tensor], Tensor]
+    terminate: Callable[[Tensor, Tensor, float], Tensor]
+
+
+_TORCH = Backend(plain.march, plain.composite_weights, plain.accumulate, plain.terminate)
+_BACKENDS: dict[str, Backend] = {"torch": _TORCH}
+_CHOICES = ("auto", "compiled", "torch")
+_choice = "auto"
+
+
+def register_backend(name: str, backend: Backend) -> None:
+    """Make ``backend`` available as ``name``; a second registration replaces the first.
+
+    Raises:
+        InputError: for any name but "compiled"; "torch" is the reference and cannot be replaced.
+    """
+    if name != "compiled":
+        raise InputError(
+            f"backend name: found {name!r}, expected 'compiled' ('torch' is the fixed reference)"
+        )
+    _BACKENDS[name] = backend
+
+
+def registered_backends() -> tuple[str, ...]:
+    """Names of the backends that can be chosen now."""
+    return tuple(sorted(_BACKENDS))
+
+
+def chosen_backend() -> str:
+    """The name given to the last `use_backend` that is still in force: "auto" by default."""
+    return _choice
+
+
+class use_backend:
+    """Choose the implementation of the inner loops, for good or for the length of a ``with`` block.
+
+    The choice holds for the whole process: a viewer's thread follows the trainer's.
+
+    Args:
+        name: "torch" forces the plain versions; "compiled" and "auto" take the compiled ones for CPU float32
+            tensors and the plain ones for all others, "auto" also while nothing compiled is registered.
+
+    Raises:
+        InputError: for an unknown name, or for "compiled" while nothing is registered under it.
+
+    Example:
+        >>> with use_backend("torch"):
+        ...     chosen_backend()
+        'torch'
+        >>> chosen_backend()
+        'auto'
+    """
+
+    def __init__(self, name: str) -> None:
+        global _choice
+        if name not in _CHOICES:
+            raise InputError(f"backend: found {name!r}, expected one of {', '.join(_CHOICES)}")
+        if name == "compiled" and "compiled" not in _BACKENDS:
+            raise InputError(
+                "backend 'compiled': nothing is registered, expected `import backbones.kernels` before"
+            )
+        self._previous = _choice
+        _choice = name
+
+    def __enter__(self) -> use_backend:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        global _choice
+        _choice = self._previous
+
+
+def takes_compiled(*tensors: Tensor) -> bool:
+    """Whether the current choice sends these tensors to compiled code: all on the CPU, all float32."""
+    if _choice == "torch" or "compiled" not in _BACKENDS:
+        return False
+    return all(x.device.type == "cpu" and x.dtype == torch.float32 for x in tensors)
+
+
+def _backend(*tensors: Tensor) -> Backend:
+    return _BACKENDS["compiled"] if takes_compiled(*tensors) else _TORCH
+
+
+def march(
+    origins: Tensor,
+    directions: Tensor,
+    t_min: Tensor,
+    t_max: Tensor,
+    step: float,
+    cells: Tensor,
+    bounds: Tensor,
+    jitter: Tensor | float,
+) -> Marched:
+    """Sample rays at a fixed step, keeping the samples that lie in occupied cells.
+
+    Sample ``index`` of a ray lies at ``t = t_min + (index + jitter) * step`` and is kept when ``t < t_max`` and the
+    cell ``floor(u * cells.shape)`` of its position is occupied, ``u`` the position normalised to ``bounds``.
+    Positions outside ``bounds`` are in no cell; within a thousandth of a cell of a face they count as inside. Every
+    operation is rounded to the rays' dtype in the order of the formula, so all backends keep exactly the same
+    samples.
+
+    Args:
+        origins, directions: ``(R, 3)``, world units; directions have length 1.
+        t_min, t_max: ``(R,)`` entry and exit distance; a ray with ``t_min >= t_max`` has no samples.
+        step: distance between samples, world units.
+        cells: ``(X, Y, Z)`` uint8 or bool occupancy, nonzero = occupied.
+        bounds: ``(2, 3)`` corners of the box that ``cells`` divides.
+        jitter: in [0, 1): ``(R,)`` or one number; 0.5 for rendering.
+
+    Returns:
+        ``offsets (R + 1,)`` int64, ``index (N,)`` int64, ``t (N,)`` and ``positions (N, 3)``; the samples of ray r
+        are ``offsets[r] : offsets[r + 1]`` in increasing ``t``. Not differentiable.
+
+    Raises:
+        InputError: for shapes that do not fit, a step that is not positive, or an infinite range.
+
+    Example:
+        >>> o, d = torch.zeros(1, 3), torch.tensor([[1.0, 0.0, 0.0]])
+        >>> cells = torch.tensor([0, 1], dtype=torch.uint8).reshape(2, 1, 1)
+        >>> bounds = torch.tensor([[0.0, -1.0, -1.0], [4.0, 1.0, 1.0]])
+        >>> offsets, index, t, _ = march(o, d, torch.zeros(1), torch.full((1,), 4.0), 1.0, cells, bounds, 0.5)
+        >>> offsets.tolist(), index.tolist(), t.tolist()
+        ([0, 2], [2, 3], [2.5, 3.5])
+    """
+    plain.check_march(origins, directions, t_min, t_max, step, cells, bounds, jitter)
+    backend = _backend(origins, directions, t_min, t_max, bounds)
+    return backend.march(origins, directions, t_min, t_max, step, cells, bounds, jitter)
+
+
+def composite_weights(optical_depth: Tensor, offsets: Tensor) -> Tensor:
+    """Volume rendering weights ``w_i = T_i (1 - exp(-tau_i))``, ``T_i = exp(-sum_{j < i} tau_j)``.
+
+    Args:
+        optical_depth: ``tau (N,)``, density x interval length, at least 0; ``inf`` is an opaque sample.
+        offsets: ``(R + 1,)`` int64; the samples of ray r are ``offsets[r] : offsets[r + 1]``.
+
+    Returns:
+        ``(N,)`` weights, differentiable once.
+
+    Raises:
+        InputError: if ``offsets`` does not end at N.
+
+    References:
+        Max, "Optical models for direct volume rendering" (1995); Mildenhall et al., "NeRF" (2020), equation 3.
+
+    Example:
+        >>> composite_weights(torch.tensor([0.6931472, 0.6931472]), torch.tensor([0, 2])).tolist()
+        [0.5, 0.25]
+    """
+    plain.check_packed(optical_depth, offsets, "optical_depth")
+    return _backend(optical_depth).composite_weights(optical_depth, offsets)
+
+
+def accumulate(weights: Tensor, values: Tensor, offsets: Tensor) -> Tensor:
+    """Weighted sum of ``values`` along every ray.
+
+    Args:
+        weights: ``(N,)``.
+        values: ``(N, K)``.
+        offsets: ``(R + 1,)`` int64.
+
+    Returns:
+        ``(R, K)``, 0 for rays without samples; differentiable once in both.
+
+    Raises:
+        InputError: if the shapes do not fit.
+
+    Example:
+        >>> accumulate(torch.tensor([0.5, 0.25]), torch.ones(2, 1), torch.tensor([0, 2, 2])).tolist()
+        [[0.75], [0.0]]
+    """
+    plain.check_packed(weights, offsets, "weights")
+    if values.dim() != 2 or values.shape[0] != weights.shape[0]:
+        raise InputError(f"values: found shape {tuple(values.shape)}, expected ({weights.shape[0]}, K)")
+    return _backend(weights, values).accumulate(weights, values, offsets)
+
+
+def terminate(optical_depth: Tensor, offsets: Tensor, bound: float) -> Tensor:
+    """Mask of the samples that are still seen: the transmittance before them is at least ``bound``.
+
+    Args:
+        optical_depth: ``(N,)``, as for `composite_weights`.
+        offsets: ``(R + 1,)`` int64.
+        bound: in [0, 1]; dropping the rest changes a colour in [0, 1] by less than this.
+
+    Returns:
+        ``(N,)`` bool; along a ray it never turns from False to True.
+
+    Raises:
+        InputError: if ``offsets`` does not end at N.
+
+    Example:
+        >>> terminate(torch.tensor([1.0, 9.0, 1.0]), torch.tensor([0, 3]), 1e-3).tolist()
+        [True, True, False]
+    """
+    plain.check_packed(optical_depth, offsets, "optical_depth")
+    return _backend(optical_depth).terminate(optical_depth, offsets, bound)
