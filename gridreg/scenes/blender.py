@@ -1,0 +1,116 @@
+"""Reader for Blender scenes: nerf_synthetic, and what the BlenderNeRF add-on exports."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from gridreg.errors import InputError
+from gridreg.scenes.frames import Camera, Frame, SceneFiles, check_pose
+
+__all__ = ["read_blender", "read_json"]
+
+_DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+
+
+def read_blender(folder: Path) -> SceneFiles:
+    """Read ``transforms_train.json`` and ``transforms_test.json`` without opening an image.
+
+    ``camera_angle_y`` is ignored: BlenderNeRF derives it from the sensor's height, which does not fit images
+    of another aspect; ``fl_x`` and ``fl_y`` count, and square pixels are assumed where they are missing.
+
+    Raises:
+        InputError: for a missing file or key, a number that is not one, a pose that is not rigid, or a lens
+            that distorts.
+    """
+    sources = {split: folder / f"transforms_{split}.json" for split in ("train", "test")}
+    lists = {split: _read_frames(path) for split, path in sources.items()}
+    return SceneFiles(folder, lists["train"], lists["test"], sources)
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON object.
+
+    Raises:
+        InputError: when the file is missing, is not JSON or holds something else.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"{path}: file not found") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: not valid JSON ({' '.join(str(error).split())})") from None
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: found a {type(content).__name__}, expected a JSON object")
+    return content
+
+
+def _read_frames(path: Path) -> list[Frame]:
+    content = read_json(path)
+    frames = content.get("frames")
+    if frames is None:
+        raise InputError(f"{path}: key 'frames' is missing")
+    if not isinstance(frames, list) or not frames:
+        raise InputError(f"{path}: 'frames' is not a list with at least one frame")
+    return [_read_frame(content, entry, f"{path}: frame {i}") for i, entry in enumerate(frames)]
+
+
+def _read_frame(shared: dict[str, Any], entry: object, where: str) -> Frame:
+    if not isinstance(entry, dict):
+        raise InputError(f"{where}: found a {type(entry).__name__}, expected a JSON object")
+    for key in ("file_path", "transform_matrix"):
+        if key not in entry:
+            raise InputError(f"{where}: key '{key}' is missing")
+    if not isinstance(entry["file_path"], str):
+        raise InputError(f"{where}: file_path is a {type(entry['file_path']).__name__}, expected a string")
+    # A frame's own intrinsics win over those of the file.
+    camera = read_camera({**shared, **entry}, where)
+    return Frame(entry["file_path"], check_pose(entry["transform_matrix"], where), camera, where)
+
+
+def read_camera(values: dict[str, Any], where: str) -> Camera:
+    """Read intrinsics by the keys of nerf_synthetic and instant-ngp.
+
+    Raises:
+        InputError: when a number is out of range, the lens distorts, or no focal length is there.
+    """
+    for key in _DISTORTION:
+        if _number(values, key, where) not in (None, 0.0):
+            raise InputError(
+                f"{where}: lens distortion {key} = {values[key]} is not supported here, expected 0"
+            )
+    angle = _number(values, "camera_angle_x", where)
+    fx, fy = _number(values, "fl_x", where), _number(values, "fl_y", where)
+    if fx is None and angle is None:
+        raise InputError(f"{where}: key 'camera_angle_x' (or 'fl_x') is missing")
+    if angle is not None and not 0 < angle < math.pi:
+        raise InputError(f"{where}: camera_angle_x is {angle}, expected radians between 0 and pi")
+    for key, focal in (("fl_x", fx), ("fl_y", fy)):
+        if focal is not None and focal <= 0:
+            raise InputError(f"{where}: {key} is {focal}, expected a positive number of pixels")
+    width, height = _number(values, "w", where), _number(values, "h", where)
+    for key, edge in (("w", width), ("h", height)):
+        if edge is not None and (edge < 1 or edge != round(edge)):
+            raise InputError(f"{where}: {key} is {edge}, expected a whole number of pixels")
+    return Camera(
+        angle_x=angle,
+        fx=fx,
+        fy=fy,
+        cx=_number(values, "cx", where),
+        cy=_number(values, "cy", where),
+        width=None if width is None else int(width),
+        height=None if height is None else int(height),
+    )
+
+
+def _number(values: dict[str, Any], key: str, where: str) -> float | None:
+    value = values.get(key)
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        raise InputError(f"{where}: {key} is {value!r}, expected a finite number")
+    return float(value)

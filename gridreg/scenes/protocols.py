@@ -1,0 +1,187 @@
+"""Named protocols: which views are trained on and scored, at which size and on which background.
+
+Figures of different protocols are not comparable: published baselines scatter by 1-2 dB between them.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gridreg.errors import InputError
+
+__all__ = [
+    "PROTOCOLS",
+    "Every",
+    "First",
+    "KMeans",
+    "Listed",
+    "Protocol",
+    "Seeded",
+    "Selection",
+    "get_protocol",
+]
+
+
+@dataclass(frozen=True)
+class Listed:
+    """Exactly these indices."""
+
+    indices: tuple[int, ...]
+
+    def select(self, positions: NDArray[np.float64]) -> tuple[int, ...]:
+        """Return the indices; whether they exist is for the loader to say."""
+        return self.indices
+
+
+@dataclass(frozen=True)
+class Every:
+    """Every ``stride``-th frame from the first; ``Every(1)`` is all of them."""
+
+    stride: int
+
+    def select(self, positions: NDArray[np.float64]) -> tuple[int, ...]:
+        """Return 0, stride, 2 stride, ... below the number of frames."""
+        return tuple(range(0, len(positions), self.stride))
+
+
+@dataclass(frozen=True)
+class First:
+    """The first ``count`` frames."""
+
+    count: int
+
+    def select(self, positions: NDArray[np.float64]) -> tuple[int, ...]:
+        """Return 0 .. count - 1."""
+        return tuple(range(self.count))
+
+
+@dataclass(frozen=True)
+class Seeded:
+    """``count`` frames by NumPy's ``choice`` without replacement; a larger count extends a smaller one."""
+
+    count: int
+    seed: int = 0
+
+    def select(self, positions: NDArray[np.float64]) -> tuple[int, ...]:
+        """Return the choice; for 8 of 100 frames and seed 0 it is DietNeRF's list."""
+        if self.count > len(positions):
+            return tuple(range(self.count))
+        # The legacy generator, because the published list came from it.
+        chosen = np.random.RandomState(self.seed).choice(len(positions), self.count, replace=False)
+        return tuple(int(i) for i in chosen)
+
+
+@dataclass(frozen=True)
+class KMeans:
+    """The frames nearest to the ``count`` k-means centres of the camera positions (ZeroRF, section 4)."""
+
+    count: int
+    seed: int = 0
+
+    def select(self, positions: NDArray[np.float64]) -> tuple[int, ...]:
+        """Return one frame per cluster, in increasing order: Lloyd's iterations from k-means++ centres."""
+        if self.count > len(positions):
+            return tuple(range(self.count))
+        rng = np.random.default_rng(self.seed)
+        centres = positions[[int(rng.integers(len(positions)))]]
+        while len(centres) < self.count:
+            gap = _squared_distances(positions, centres).min(axis=1)
+            # Cameras at one place leave nothing to spread over: any of them is as good.
+            share = gap / gap.sum() if gap.sum() > 0 else np.full(len(gap), 1 / len(gap))
+            centres = np.concatenate([centres, positions[[int(rng.choice(len(positions), p=share))]]])
+        for _ in range(100):
+            nearest = _squared_distances(positions, centres).argmin(axis=1)
+            moved = np.stack(
+                [
+                    positions[nearest == k].mean(axis=0) if (nearest == k).any() else c
+                    for k, c in enumerate(centres)
+                ]
+            )
+            if np.array_equal(moved, centres):
+                break
+            centres = moved
+        distances = _squared_distances(positions, centres)
+        chosen: list[int] = []
+        for k in range(self.count):
+            distances[chosen, k] = np.inf
+            chosen.append(int(distances[:, k].argmin()))
+        return tuple(sorted(chosen))
+
+
+Selection = Listed | Every | First | Seeded | KMeans
+
+
+def _squared_distances(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(((a[:, None] - b[None]) ** 2).sum(axis=-1))
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """Views, size, background and where they come from.
+
+    Attributes:
+        name: the protocol's name.
+        train: selection from the training frames, by index into their list.
+        test: selection from the test frames, by index into their list.
+        halve_at: images of this edge, in pixels, are halved by 2x2 area means of RGBA before compositing.
+        background: ``"white"`` or ``"black"``.
+        source: who uses it.
+    """
+
+    name: str
+    train: Selection
+    test: Selection
+    halve_at: int | None
+    background: str
+    source: str
+
+
+_DIETNERF = Listed((26, 86, 2, 55, 75, 93, 16, 73))
+_GAUSSIAN = Listed((2, 16, 26, 55, 73, 76, 86, 93))
+_EVERY_SIXTH = Listed((0, 6, 12, 18, 24, 30, 36, 42))
+
+PROTOCOLS: dict[str, Protocol] = {
+    protocol.name: protocol
+    for protocol in (
+        Protocol("dietnerf8", _DIETNERF, Every(8), 800, "white", "DietNeRF, FreeNeRF, SANeRF"),
+        Protocol("gs8", _GAUSSIAN, Every(8), 800, "white", "Gaussian-splatting papers"),
+        Protocol(
+            "fewtensorf8", _EVERY_SIXTH, Every(8), 800, "white", "Few TensoRF, the authors' configuration"
+        ),
+        Protocol("zerorf4", KMeans(4), Every(1), None, "white", "ZeroRF, FourieRF"),
+        Protocol("zerorf6", KMeans(6), Every(1), None, "white", "ZeroRF, FourieRF"),
+        Protocol("human8", _EVERY_SIXTH, Every(1), None, "white", "Few TensoRF, human bodies, 8 views"),
+        Protocol("human50", First(50), Every(1), None, "white", "Few TensoRF, human bodies, 50 views"),
+        Protocol(
+            "builtin8", First(8), Every(1), None, "white", "the built-in scene; not a published benchmark"
+        ),
+    )
+}
+"""The protocols by name; :func:`get_protocol` knows the counted forms as well."""
+
+
+def get_protocol(name: str) -> Protocol:
+    """Return the protocol of that name.
+
+    Besides :data:`PROTOCOLS`, ``views<N>`` stands for N training views by NumPy's seed-0 choice and
+    ``first<N>`` for the first N, both with size, background and test views of ``dietnerf8``.
+
+    Raises:
+        InputError: for an unknown name.
+
+    >>> get_protocol("views8").train.select(np.zeros((100, 3))) == get_protocol("dietnerf8").train.indices
+    True
+    """
+    if name in PROTOCOLS:
+        return PROTOCOLS[name]
+    counted = re.fullmatch(r"(views|first)([1-9]\d{0,5})", name)
+    if counted is None:
+        known = ", ".join(PROTOCOLS)
+        raise InputError(f"protocol: found {name!r}, expected one of {known}, views<N> or first<N>")
+    count = int(counted[2])
+    train: Selection = Seeded(count) if counted[1] == "views" else First(count)
+    return Protocol(name, train, Every(8), 800, "white", f"a study with {count} views")
