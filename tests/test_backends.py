@@ -187,7 +187,7 @@ class TestCompositing:
         weights = composite_weights(tau, torch.tensor([0, 3, 4]))
         weights.sum().backward()
         assert weights[2] == 0
-        assert float(weights[:3].sum()) == pytest.approx(1.0)
+        assert weights[:3].sum().item() == pytest.approx(1.0)
         assert tau.grad is not None
         assert torch.isfinite(tau.grad).all()
 
@@ -225,7 +225,7 @@ class TestChoice:
         assert registered_backends() == ("torch",)
         with pytest.raises(InputError, match="expected one of auto, compiled, torch"):
             use_backend("cuda")
-        with pytest.raises(InputError, match="import backbones.kernels"):
+        with pytest.raises(InputError, match="import backbones"):
             use_backend("compiled")
         with pytest.raises(InputError, match="'torch'"):
             register_backend("torch", backends._TORCH)

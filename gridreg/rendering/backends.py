@@ -135,11 +135,11 @@ def march(
 ) -> Marched:
     """Sample rays at a fixed step, keeping the samples that lie in occupied cells.
 
-    Sample ``index`` of a ray lies at ``t = t_min + (index + jitter) * step`` and is kept when ``t < t_max`` and the
-    cell ``floor(u * cells.shape)`` of its position is occupied, ``u`` the position normalised to ``bounds``.
-    Positions outside ``bounds`` are in no cell; within a thousandth of a cell of a face they count as inside. Every
-    operation is rounded to the rays' dtype in the order of the formula, so all backends keep exactly the same
-    samples.
+    Sample ``index`` of a ray lies at ``t = t_min + (index + jitter) * step`` and is kept when ``t < t_max``
+    and the cell ``floor(u * cells.shape)`` of its position is occupied, ``u`` the position normalised to
+    ``bounds``. Positions outside ``bounds`` are in no cell; within a thousandth of a cell of a face they
+    count as inside. Every operation is rounded to the rays' dtype in the order of the formula, so all
+    backends keep exactly the same samples.
 
     Args:
         origins, directions: ``(R, 3)``, world units; directions have length 1.
@@ -150,8 +150,8 @@ def march(
         jitter: in [0, 1): ``(R,)`` or one number; 0.5 for rendering.
 
     Returns:
-        ``offsets (R + 1,)`` int64, ``index (N,)`` int64, ``t (N,)`` and ``positions (N, 3)``; the samples of ray r
-        are ``offsets[r] : offsets[r + 1]`` in increasing ``t``. Not differentiable.
+        ``offsets (R + 1,)`` int64, ``index (N,)`` int64, ``t (N,)`` and ``positions (N, 3)``; the samples of
+        ray r are ``offsets[r] : offsets[r + 1]`` in increasing ``t``. Not differentiable.
 
     Raises:
         InputError: for shapes that do not fit, a step that is not positive, or an infinite range.
@@ -183,7 +183,8 @@ def composite_weights(optical_depth: Tensor, offsets: Tensor) -> Tensor:
         InputError: if ``offsets`` does not end at N.
 
     References:
-        Max, "Optical models for direct volume rendering" (1995); Mildenhall et al., "NeRF" (2020), equation 3.
+        Max, "Optical models for direct volume rendering" (1995); Mildenhall et al., "NeRF" (2020), equation
+        3.
 
     Example:
         >>> composite_weights(torch.tensor([0.6931472, 0.6931472]), torch.tensor([0, 2])).tolist()

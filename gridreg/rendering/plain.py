@@ -1,4 +1,4 @@
-"""Plain PyTorch versions of the inner loops, on any device and in any float dtype; `backends` documents them."""
+"""Plain PyTorch versions of the inner loops for any device and float dtype; `backends` documents them."""
 
 from __future__ import annotations
 
