@@ -1,0 +1,110 @@
+"""Sums along the rays of packed samples, by which results do not depend on the timing of threads."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+__all__ = ["optical_depth_to_weights", "spread", "sum_before", "sum_per_ray"]
+
+
+class _SumPerRay(torch.autograd.Function):
+    """Sums of consecutive segments; its transpose is `_Spread`, so neither needs atomic additions."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, offsets: Tensor, ray_indices: Tensor) -> Tensor:
+        ctx.save_for_backward(offsets, ray_indices)
+        if values.shape[0] == 0:
+            return values.new_zeros((offsets.shape[0] - 1, *values.shape[1:]))
+        return torch.segment_reduce(values.contiguous(), "sum", offsets=offsets, axis=0, unsafe=True)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:
+        return spread(gradients[0], *ctx.saved_tensors), None, None
+
+
+class _Spread(torch.autograd.Function):
+    """The value of each ray, repeated for each of its samples."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, offsets: Tensor, ray_indices: Tensor) -> Tensor:
+        ctx.save_for_backward(offsets, ray_indices)
+        return values.index_select(0, ray_indices)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:
+        return sum_per_ray(gradients[0], *ctx.saved_tensors), None, None
+
+
+class _SumBefore(torch.autograd.Function):
+    """Sum over the earlier samples of the same ray (exclusive prefix sum)."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, offsets: Tensor, ray_indices: Tensor) -> Tensor:
+        ctx.save_for_backward(offsets, ray_indices)
+        # One running sum over all rays, less its value where the ray begins. In float32 the difference would
+        # lose the digits that the earlier rays have used up; float64 keeps them.
+        wide = values.double()
+        before = wide.cumsum(0) - wide
+        last = max(before.shape[0] - 1, 0)
+        begin = before.index_select(0, offsets[:-1].clamp(max=last)) if before.shape[0] else before
+        return (before - begin.index_select(0, ray_indices)).to(values.dtype)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:
+        gradient = gradients[0]
+        total = spread(sum_per_ray(gradient, *ctx.saved_tensors), *ctx.saved_tensors)
+        return total - gradient - sum_before(gradient, *ctx.saved_tensors), None, None
+
+
+def sum_per_ray(values: Tensor, offsets: Tensor, ray_indices: Tensor) -> Tensor:
+    """Add ``(N, ...)`` along each ray.
+
+    Args:
+        values: ``(N, ...)``, packed.
+        offsets: ``(R + 1,)`` int64, where the samples of each ray begin.
+        ray_indices: ``(N,)`` int64, ray of each sample.
+
+    Returns:
+        ``(R, ...)``; 0 for a ray without samples.
+    """
+    result: Tensor = _SumPerRay.apply(values, offsets, ray_indices)  # type: ignore[no-untyped-call]
+    return result
+
+
+def spread(values: Tensor, offsets: Tensor, ray_indices: Tensor) -> Tensor:
+    """Give each sample the value of its ray, the transpose of `sum_per_ray`: ``(R, ...)`` to ``(N, ...)``."""
+    result: Tensor = _Spread.apply(values, offsets, ray_indices)  # type: ignore[no-untyped-call]
+    return result
+
+
+def sum_before(values: Tensor, offsets: Tensor, ray_indices: Tensor) -> Tensor:
+    """Add over the earlier samples of the same ray (exclusive prefix sum): ``(N,)`` to ``(N,)``."""
+    result: Tensor = _SumBefore.apply(values, offsets, ray_indices)  # type: ignore[no-untyped-call]
+    return result
+
+
+def optical_depth_to_weights(optical_depth: Tensor, offsets: Tensor) -> Tensor:
+    """Weights ``w_i = T_i (1 - exp(-tau_i))`` with the transmittance ``T_i = exp(-sum_{j<i} tau_j)``.
+
+    Args:
+        optical_depth: ``(N,)`` density times interval length, packed; no unit.
+        offsets: ``(R + 1,)`` int64, where the samples of each ray begin.
+
+    Returns:
+        ``(N,)`` weights in [0, 1]; along a ray they add to its opacity. Source: NeRF (Mildenhall et al.
+        2020), equation 3.
+
+    Example:
+        >>> import torch
+        >>> optical_depth_to_weights(torch.tensor([0.0, 200.0, 1.0]), torch.tensor([0, 3]))
+        tensor([0., 1., 0.])
+    """
+    rays = torch.arange(offsets.shape[0] - 1, device=offsets.device)
+    ray_indices = torch.repeat_interleave(
+        rays, offsets[1:] - offsets[:-1], output_size=optical_depth.shape[0]
+    )
+    transmittance = torch.exp(-sum_before(optical_depth, offsets, ray_indices))
+    return transmittance * -torch.expm1(-optical_depth)

@@ -1,0 +1,74 @@
+"""Independent NumPy versions of the formulas, written from the papers, and batches to try them on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from gridreg.samples import RaySamples
+
+Array = NDArray[np.float64]
+
+
+@dataclass
+class Batch:
+    """A rectangle of rays in NumPy; where `valid` is False the sample is skipped and counts as density 0."""
+
+    t: Array
+    delta: Array
+    density: Array
+    colours: Array
+    valid: NDArray[np.bool_]
+
+    @property
+    def alpha(self) -> Array:
+        return np.where(self.valid, 1 - np.exp(-self.density * self.delta), 0.0)
+
+    @property
+    def weights(self) -> Array:
+        result = np.zeros_like(self.t)
+        for ray, alphas in enumerate(self.alpha):
+            transmittance = 1.0
+            for i, alpha in enumerate(alphas):
+                result[ray, i] = transmittance * alpha
+                transmittance *= 1 - alpha
+        return result
+
+    def samples(self, *, grad: bool = False, **extra: object) -> RaySamples:
+        """The batch as the toolkit sees it, packed, in float64."""
+        dense = {name: torch.tensor(getattr(self, name)) for name in ("t", "delta", "density", "colours")}
+        dense["density"].requires_grad_(grad)
+        valid = torch.tensor(self.valid)
+        return RaySamples.from_dense(**dense, valid=valid, **extra)  # type: ignore[arg-type]
+
+    def rays(self) -> Iterator[tuple[Array, Array, Array]]:
+        """Distances, interval lengths and weights of the kept samples of each ray."""
+        weights = self.weights
+        for ray, kept in enumerate(self.valid):
+            yield self.t[ray, kept], self.delta[ray, kept], weights[ray, kept]
+
+
+def make_batch(seed: int, rays: int, width: int, kept: float = 0.7, scale: float = 2.0) -> Batch:
+    """Random rays; about a share `kept` of the samples is valid."""
+    rng = np.random.default_rng(seed)
+    delta = rng.uniform(0.05, 0.3, (rays, width))
+    t = 2.0 + np.cumsum(delta, 1) - delta / 2
+    density = rng.exponential(scale, (rays, width))
+    return Batch(
+        t, delta, density, rng.uniform(0, 1, (rays, width, 3)), rng.uniform(size=(rays, width)) < kept
+    )
+
+
+batches = st.builds(
+    make_batch,
+    seed=st.integers(0, 2**16),
+    rays=st.integers(0, 6),
+    width=st.integers(0, 9),
+    kept=st.sampled_from([0.0, 0.3, 0.8, 1.0]),
+    scale=st.sampled_from([0.1, 3.0, 100.0]),
+)
