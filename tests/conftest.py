@@ -1,4 +1,4 @@
-"""Settings of every test: Hypothesis draws the same examples every time and has no deadline on a busy machine."""
+"""Settings of every test: Hypothesis draws the same examples every time, without a deadline."""
 
 from __future__ import annotations
 
