@@ -12,7 +12,7 @@ from torch.nn import functional as F
 from backbones.decoders import make_decoder
 from gridreg.sites import Site
 
-__all__ = ["TensorialField", "density_shift_for", "resolution_of"]
+__all__ = ["TensorialField", "density_shift_for"]
 
 
 def density_shift_for(opacity: float, length: float, distance_scale: float) -> float:
@@ -34,19 +34,6 @@ def density_shift_for(opacity: float, length: float, distance_scale: float) -> f
     if not 0 < opacity < 1:
         raise ValueError(f"initial_opacity={opacity}: expected a number between 0 and 1, both excluded")
     return math.log(math.expm1(-math.log1p(-opacity) / (length * distance_scale)))
-
-
-def resolution_of(voxels: float, bounds: Tensor) -> tuple[int, int, int]:
-    """Nodes along x, y, z of a grid with cubic cells and about ``voxels`` of them (TensoRF ``N_to_reso``).
-
-    Example:
-        >>> resolution_of(8e3, torch.tensor([[0., 0., 0.], [1., 1., 1.]]))
-        (20, 20, 20)
-    """
-    size = (bounds[1] - bounds[0]).double()
-    edge = float((size.prod() / voxels) ** (1 / 3))
-    x, y, z = (max(2, int(round(float(s) / edge, 6))) for s in size)
-    return x, y, z
 
 
 class TensorialField(nn.Module):

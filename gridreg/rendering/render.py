@@ -75,10 +75,10 @@ class Rendered:
 
 
 def _march(
-    field: Any, rays: Rays, occupancy: OccupancyGrid, march: March, jitter: Tensor
+    field: Any, rays: Rays, t_range: tuple[Tensor, Tensor], occupancy: OccupancyGrid, march: March, jitter: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Offsets, index, t, positions and density of the samples that are not hidden."""
-    t_min, t_max = box_intersection(rays, field.bounds, march.near, march.far)
+    t_min, t_max = t_range
     fused = getattr(field, "march_density", None)
     if fused is not None:
         found: tuple[Tensor, Tensor, Tensor, Tensor, Tensor] = fused(
@@ -133,7 +133,8 @@ def render_rays(
     """
     if jitter is None:
         jitter = torch.full((len(rays),), 0.5, dtype=rays.origins.dtype, device=rays.origins.device)
-    offsets, index, t, positions, density = _march(field, rays, occupancy, march, jitter)
+    t_min, t_max = box_intersection(rays, field.bounds, march.near, march.far)
+    offsets, index, t, positions, density = _march(field, rays, (t_min, t_max), occupancy, march, jitter)
     delta = torch.full_like(t, march.step)
     samples = RaySamples(
         offsets=offsets,
@@ -144,6 +145,8 @@ def render_rays(
         weights=backends.composite_weights(density * march.step, offsets),
         positions=positions,
         directions=rays.directions,
+        ray_start=t_min,
+        ray_steps=((t_max - t_min) / march.step - jitter).ceil().clamp(min=0).long(),
     )
     visible = samples.weights.detach() > march.weight_bound
     chosen = visible.nonzero().squeeze(-1)

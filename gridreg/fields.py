@@ -1,0 +1,56 @@
+"""Fields by name: installed packages offer them as entry points of the group ``gridreg.fields``."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable
+from importlib.metadata import entry_points
+from typing import Any
+
+from torch import nn
+
+from gridreg.errors import InputError
+
+__all__ = ["field_names", "make_field", "register_field"]
+
+_registered: dict[str, Callable[..., nn.Module]] = {}
+
+
+def register_field(name: str, constructor: Callable[..., nn.Module]) -> None:
+    """Make a field's constructor known by a name, for configurations and checkpoints.
+
+    Args:
+        name: as in ``backbone: name``.
+        constructor: called as ``constructor(bounds, resolution, generator=..., **options)``.
+    """
+    _registered[name] = constructor
+
+
+def field_names() -> list[str]:
+    """Names that `make_field` accepts."""
+    return sorted({*_registered, *(entry.name for entry in entry_points(group="gridreg.fields"))})
+
+
+def make_field(name: str, *arguments: Any, **options: Any) -> nn.Module:
+    """Construct a field by name.
+
+    Args:
+        name: registered with `register_field`, or an entry point of an installed package.
+        arguments, options: for its constructor.
+
+    Raises:
+        InputError: if there is no field of this name, or its constructor refuses an option.
+    """
+    constructor = _registered.get(name)
+    if constructor is None:
+        found = [entry for entry in entry_points(group="gridreg.fields") if entry.name == name]
+        if not found:
+            known = field_names()
+            near = difflib.get_close_matches(name, known, n=1)
+            hint = f"; did you mean {near[0]!r}?" if near else ""
+            raise InputError(f"backbone: found {name!r}, expected one of {', '.join(known)}{hint}")
+        constructor = found[0].load()
+    try:
+        return constructor(*arguments, **options)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"backbone {name!r}: {error}") from error

@@ -1,0 +1,126 @@
+"""Everything that determines a run, as plain data."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from gridreg.errors import InputError
+
+__all__ = ["RunConfig", "TrainSettings"]
+
+
+@dataclass(frozen=True)
+class TrainSettings:
+    """The schedule of a run; the defaults are TensoRF's for the synthetic scenes.
+
+    Args:
+        steps: iterations.
+        rays: per iteration.
+        learning_rate_grid, learning_rate_network: Adam's, at the start (betas 0.9 and 0.99).
+        learning_rate_decay: factor over the whole run, exponential in the iteration.
+        reset_learning_rate: start the decay again at every resampling, as TensoRF does.
+        voxels_start, voxels_end: cells of the grid; resampled in logarithmic steps.
+        resample_at: iterations of the resamplings.
+        occupancy_at: iterations at which empty cells are found.
+        occupancy_every: also every so many iterations after the first of those; 0: never.
+        occupancy_resolution: largest number of occupancy cells along an axis.
+        occupancy_threshold: opacity over one step below which a cell is empty.
+        shrink_at: iterations at which the box shrinks to the occupied cells; a subset of ``occupancy_at``, or 0 with ``carve``.
+        filter_rays_at: iterations from which rays that meet no occupied cell are not drawn any more.
+        carve: start from the visual hull of the training views' alpha.
+        step_ratio: ray step in cells.
+        weight_bound: colour is evaluated where the weight exceeds this.
+        transmittance_bound: samples behind this transmittance are dropped.
+        checkpoint_minutes: between checkpoints.
+        evaluate_at: iterations at which the validation views (or, without them, some test views) are scored on the way.
+    """
+
+    steps: int = 15_000
+    rays: int = 1024
+    learning_rate_grid: float = 0.02
+    learning_rate_network: float = 1e-3
+    learning_rate_decay: float = 0.1
+    reset_learning_rate: bool = True
+    voxels_start: int = 128**3
+    voxels_end: int = 300**3
+    resample_at: tuple[int, ...] = (2000, 3000, 4000, 5500, 7000)
+    occupancy_at: tuple[int, ...] = (2000, 4000)
+    occupancy_every: int = 0
+    occupancy_resolution: int = 128
+    occupancy_threshold: float = 1e-4
+    shrink_at: tuple[int, ...] = (2000,)
+    filter_rays_at: tuple[int, ...] = (4000,)
+    carve: bool = False
+    step_ratio: float = 0.5
+    weight_bound: float = 1e-4
+    transmittance_bound: float = 1e-4
+    checkpoint_minutes: float = 2.0
+    evaluate_at: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "rays", "voxels_start", "voxels_end", "occupancy_resolution"):
+            value = getattr(self, name)
+            if value < 1:
+                raise InputError(f"train.{name}: found {value}, expected an integer of at least 1")
+        for name in ("learning_rate_grid", "learning_rate_network", "learning_rate_decay", "step_ratio"):
+            value = getattr(self, name)
+            if not (value > 0 and math.isfinite(value)):
+                raise InputError(f"train.{name}: found {value}, expected a positive number")
+        stray = [s for s in self.shrink_at if s not in self.occupancy_at and not (s == 0 and self.carve)]
+        if stray:
+            raise InputError(
+                f"train.shrink_at: found {stray[0]}, which is not in occupancy_at {self.occupancy_at}; "
+                "the box can only shrink where the occupancy is known"
+            )
+
+    def scaled(self, steps: int) -> TrainSettings:
+        """The same schedule over another number of iterations: every event moves in proportion."""
+
+        def moved(events: tuple[int, ...]) -> tuple[int, ...]:
+            return tuple(round(e * steps / self.steps) for e in events)
+
+        return replace(
+            self,
+            steps=steps,
+            resample_at=moved(self.resample_at),
+            occupancy_at=moved(self.occupancy_at),
+            occupancy_every=round(self.occupancy_every * steps / self.steps),
+            shrink_at=moved(self.shrink_at),
+            filter_rays_at=moved(self.filter_rays_at),
+            evaluate_at=moved(self.evaluate_at),
+        )
+
+    def voxels_at(self, resampling: int) -> int:
+        """Cells of the grid after the ``resampling``-th resampling (0: before the first)."""
+        count = len(self.resample_at)
+        if count == 0:
+            return self.voxels_start
+        share = resampling / count
+        return round(math.exp((1 - share) * math.log(self.voxels_start) + share * math.log(self.voxels_end)))
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """One run: what to reconstruct, with which field, regularizers and schedule.
+
+    Args:
+        preset: name of the preset that this started from, for the record.
+        scene: folder in Blender format; None for the built-in scene.
+        protocol: name, see `gridreg.scenes.PROTOCOLS`.
+        backbone: name of a registered field (``vm``, ``cp``, ``mlp``).
+        field: options of that field's constructor.
+        train: the schedule.
+        composition: regularizers as plain data, see `gridreg.from_config`.
+        seed: of every random number.
+    """
+
+    preset: str = ""
+    scene: str | None = None
+    protocol: str | None = None
+    backbone: str = "vm"
+    field: dict[str, Any] = field(default_factory=dict)
+    train: TrainSettings = field(default_factory=TrainSettings)
+    composition: list[dict[str, Any]] = field(default_factory=list)
+    seed: int = 0

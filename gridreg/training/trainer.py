@@ -1,0 +1,184 @@
+"""The loop: rays, render, loss, optimizer, events."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+import gridreg
+from gridreg.base import Regularizer
+from gridreg.errors import InputError
+from gridreg.rendering import March, OccupancyGrid, Rendered, render_rays
+from gridreg.scenes import Scene
+from gridreg.training import events
+from gridreg.training.rays import RayBank
+from gridreg.training.settings import TrainSettings
+
+__all__ = ["StepReport", "Trainer"]
+
+
+class StepReport(dict[str, float]):
+    """Figures of one iteration: ``loss``, ``mse``, ``psnr`` (dB, of the batch), and one per regularizer."""
+
+
+class Trainer:
+    """Trains a field on a scene, one iteration at a time; all that changes is in `state` and the field.
+
+    Args:
+        field: a `gridreg.rendering.Field` module that also offers ``parameter_groups()``, and for the events
+            ``resample(resolution)`` and ``shrink(bounds)``.
+        scene: training views and box.
+        composition: regularizers, attached here with `gridreg.apply`.
+        settings: the schedule.
+        seed: of rays, jitter, backgrounds and regularizers.
+    """
+
+    def __init__(
+        self, field: Any, scene: Scene, composition: list[Regularizer], settings: TrainSettings, *, seed: int = 0
+    ) -> None:
+        self.field, self.scene, self.settings = field, scene, settings
+        self.generator = torch.Generator().manual_seed(seed)
+        self.handle = gridreg.apply(field, *composition, total_steps=settings.steps, seed=seed)
+        self.bank = RayBank(scene.train)
+        self.step = 0
+        self.occupancy = OccupancyGrid.full(field.bounds, events.occupancy_resolution(field, settings))
+        self._restart_at = 0
+        self.optimizer = self._make_optimizer()
+        if settings.carve:
+            events.carve(self)
+        if 0 in settings.filter_rays_at:
+            events.filter_rays(self)
+
+    @property
+    def march(self) -> March:
+        """How rays are walked at the field's present resolution."""
+        near, far = self.scene.near, self.scene.far
+        return March(
+            step=self.settings.step_ratio * events.cell_size(self.field),
+            near=near,
+            far=far,
+            transmittance_bound=self.settings.transmittance_bound,
+            weight_bound=self.settings.weight_bound,
+        )
+
+    def _make_optimizer(self) -> torch.optim.Optimizer:
+        rates = {"grid": self.settings.learning_rate_grid, "network": self.settings.learning_rate_network}
+        groups = [{**group, "lr": rates[group["name"]]} for group in self.field.parameter_groups()]
+        groups = self.handle.parameter_groups(groups)
+        for group in groups:
+            group["initial_lr"] = group["lr"]
+        make = getattr(self.field, "make_optimizer", None)
+        if make is not None:
+            optimizer: torch.optim.Optimizer = make(groups, betas=(0.9, 0.99))
+            return optimizer
+        return torch.optim.Adam(groups, betas=(0.9, 0.99))
+
+    def _set_learning_rates(self) -> None:
+        progress = (self.step - self._restart_at) / self.settings.steps
+        factor = self.settings.learning_rate_decay**progress
+        for group in self.optimizer.param_groups:
+            group["lr"] = group["initial_lr"] * factor
+
+    def restart_optimizer(self) -> None:
+        """A fresh optimizer for replaced parameters; the decay starts anew if the settings say so."""
+        if self.settings.reset_learning_rate:
+            self._restart_at = self.step
+        self.optimizer = self._make_optimizer()
+
+    def render_batch(self) -> tuple[Rendered, Tensor]:
+        """Draw rays, render them, and composite their targets on the same background ``(R, 3)``."""
+        rays, rgba = self.bank.draw(self.settings.rays, self.generator)
+        jitter = torch.rand(len(rays), generator=self.generator)
+        default = self.scene.background.to(rgba)
+        background = self.handle.background(len(rays), self.generator, default.expand(len(rays), 3))
+        target = rgba[:, :3] * rgba[:, 3:] + (1 - rgba[:, 3:]) * background
+        march = self.march
+        near, far = self.handle.near_far(march.near, march.far)
+        march = March(march.step, near, far, march.transmittance_bound, march.weight_bound)
+        rendered = render_rays(
+            self.field, rays, self.occupancy, march, background=background, jitter=jitter, hook=self.handle
+        )
+        return rendered, target
+
+    def train_step(self) -> StepReport:
+        """One iteration.
+
+        Raises:
+            InputError: if the loss is not finite, with the step; the parameters are those before the step.
+        """
+        self.handle.step(self.step)
+        self._set_learning_rates()
+        rendered, target = self.render_batch()
+        mse = (rendered.colour - target).square().mean()
+        folded = self.handle.grid_terms() if getattr(self.optimizer, "accepts_local_terms", False) else []
+        loss = mse + self.handle.loss(rendered.samples, exclude={term.name for term in folded})
+        value = loss.item()
+        if not math.isfinite(value):
+            raise InputError(f"step {self.step}: the loss is {value}; a lower learning rate or penalty weight may help")
+        if not getattr(self.optimizer, "zeroes_gradients", False):
+            self.optimizer.zero_grad(set_to_none=True)
+        if loss.requires_grad:
+            loss.backward()  # type: ignore[no-untyped-call]
+        report = StepReport(loss=value, mse=mse.item(), psnr=-10 * math.log10(max(mse.item(), 1e-12)))
+        report.update({name: float(term) for name, term in self.handle.terms.items()})
+        if folded:
+            report.update(self.optimizer.step(local_terms=folded))  # type: ignore[arg-type, call-arg]
+        else:
+            self.optimizer.step()
+        self.step += 1
+        events.run(self)
+        return report
+
+    def train(self, until: int | None = None, each: Callable[[StepReport], bool] | None = None) -> None:
+        """Iterate until a step (default: the end of the schedule) or until ``each`` returns False."""
+        end = self.settings.steps if until is None else until
+        while self.step < end:
+            report = self.train_step()
+            if each is not None and not each(report):
+                return
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that a later process needs to go on bit for bit: nested dicts of tensors and plain values."""
+        return {
+            "step": self.step,
+            "restart_at": self._restart_at,
+            "resolution": list(getattr(self.field, "resolution", ())),
+            "field": self.field.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "handle": self.handle.state_dict(),
+            "generator": self.generator.get_state(),
+            "occupancy": {
+                "bounds": self.occupancy.bounds,
+                "cells": self.occupancy.cells,
+                "hull": self.occupancy.hull,
+            },
+            "active": self.bank.active,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from `state_dict`."""
+        self.step, self._restart_at = state["step"], state["restart_at"]
+        load_field(self.field, state, self.handle)
+        self.optimizer = self._make_optimizer()
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.handle.load_state_dict(state["handle"])
+        self.generator.set_state(state["generator"])
+        self.occupancy = OccupancyGrid(**state["occupancy"])
+        self.bank.active = state["active"]
+
+
+def load_field(field: nn.Module, state: dict[str, Any], handle: Any = None) -> None:
+    """Bring a field to the grid sizes and values of a checkpoint's state."""
+    if state["resolution"]:
+        if handle is None:
+            field.resample(tuple(state["resolution"]))  # type: ignore[operator]
+        else:
+            with handle.suspended():
+                field.resample(tuple(state["resolution"]))  # type: ignore[operator]
+    field.load_state_dict(state["field"])
+
+
