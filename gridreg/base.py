@@ -1,0 +1,253 @@
+"""The one base class of all regularizers, the registry, and the context that their methods get."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, is_dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar
+
+import torch
+from torch import Tensor
+
+from gridreg.errors import InputError
+from gridreg.schedules import Numeric, check_numeric, end_step, resolve
+from gridreg.sites import Grid, Place, Selector, Site, SiteLike
+
+if TYPE_CHECKING:
+    from gridreg.samples import RaySamples
+
+__all__ = ["REGISTRY", "Clock", "Context", "LocalTerm", "Regularizer", "overrides", "register"]
+
+
+class Clock:
+    """What all contexts of one handle share: the step, the length of the run, and the random generator.
+
+    It survives `copy.deepcopy` and pickling, which a bare `torch.Generator` does not.
+    """
+
+    def __init__(self, total_steps: int, seed: int) -> None:
+        self.step = 0
+        self.total_steps = total_steps
+        self.generator = torch.Generator().manual_seed(seed)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "generator": self.generator.get_state()}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self.generator = torch.Generator()
+        self.generator.set_state(state["generator"])
+
+
+@dataclass
+class Context:
+    """What a regularizer's methods get to know.
+
+    Attributes:
+        clock: step, total_steps and generator of the handle.
+        place: the tensor that a transform acts on; None in penalties and hooks.
+        state: tensors that belong to the regularizer at this place; the handle saves, loads and keeps them, also when
+            a parameter is replaced. Write into them in place, so that compiled code sees the change.
+    """
+
+    clock: Clock
+    place: Place | None = None
+    state: dict[str, Tensor] = field(default_factory=dict)
+
+    @property
+    def step(self) -> int:
+        """Current step, iterations."""
+        return self.clock.step
+
+    @property
+    def total_steps(self) -> int:
+        """Length of the run, iterations."""
+        return self.clock.total_steps
+
+    @property
+    def generator(self) -> torch.Generator:
+        """The handle's generator, on the CPU; its state is part of the handle's `state_dict`."""
+        return self.clock.generator
+
+    def at(
+        self, value: Numeric, name: str = "value", low: float = -float("inf"), high: float = float("inf")
+    ) -> float:
+        """The number that `value` stands for now; refused outside [low, high] under its `name`."""
+        number = resolve(value, self.step, self.total_steps, name)
+        if not low <= number <= high:
+            raise InputError(
+                f"{name}={number:g} at step {self.step}: expected a number in [{low:g}, {high:g}]"
+            )
+        return number
+
+    def end(self, until: Numeric) -> int:
+        """The step that `until` stands for (float: fraction of the run, int: step)."""
+        return end_step(until, self.step, self.total_steps)
+
+
+@dataclass(frozen=True, eq=False)
+class LocalTerm:
+    """A part of a grid penalty with a closed form, so that a fused optimizer step can add its gradient.
+
+    The part equals `scale` times the form named by `kind`, with p the parameter:
+
+    * "total_variation": sum over the spatial axes of mean((p[i + 1] - p[i])^2 along the axis)
+    * "l1": mean(abs(p))
+    * "l2": mean(p^2)
+
+    Attributes:
+        name: the regularizer's name in `handle.terms` (the handle fills it in).
+        kind: one of the above.
+        scale: factor; from the regularizer without its weight, from `handle.grid_terms()` with it.
+        parameter: the raw parameter.
+        spatial: its spatial axes.
+    """
+
+    kind: Literal["total_variation", "l1", "l2"]
+    scale: float
+    parameter: Tensor
+    spatial: tuple[int, ...]
+    name: str = ""
+
+
+@dataclass(frozen=True)
+class Regularizer:
+    """Base of all regularizers: a frozen dataclass whose fields are its configuration.
+
+    A regularizer plays one or more parts. Each part is a method below that does nothing by default; the handle finds out
+    which parts a class plays by looking at what it overrides. Whatever changes during a run lives in the context's state.
+
+    Class attributes:
+        acts_on: the part of a declared site that `transform` acts on: "mask" (channel masks) or "grids" (low-passes).
+        train_only: skip `transform` while the module that owns the tensor is in eval mode.
+        gradient_only: the forward values stay as they are, only gradients change.
+        weight: factor of the penalty, in subclasses that have one.
+    """
+
+    acts_on: ClassVar[Literal["mask", "grids"]] = "mask"
+    train_only: ClassVar[bool] = False
+    gradient_only: ClassVar[bool] = False
+
+    # --- where ---------------------------------------------------------------------------------------------------
+
+    def sites(self) -> tuple[SiteLike, ...]:
+        """Sites that it attaches to or reads; by default the field `site`, or none."""
+        site = getattr(self, "site", None)
+        return () if site is None else (site,)
+
+    # --- features and parameters ---------------------------------------------------------------------------------
+
+    def prepare(self, context: Context) -> None:
+        """Called at each `handle.step` (and when attaching): compute what `transform` needs into `context.state`."""
+
+    def transform(self, value: Tensor, context: Context) -> Tensor:
+        """The tensor that the field gets to see at `context.place` instead of `value`. Called at each access."""
+        return value
+
+    def is_identity(self, context: Context) -> bool:
+        """True: `transform` is skipped until the next step, and outputs stay bit-identical. Asked after `prepare`."""
+        return False
+
+    def open_channels(self, context: Context) -> int | None:
+        """Channels of the tensor at and beyond this index are exactly zero after `transform`; None: no such tail."""
+        return None
+
+    # --- losses --------------------------------------------------------------------------------------------------
+
+    def needs(self) -> tuple[str, ...]:
+        """Attributes of the samples that `penalty` reads and that a renderer may leave out (None)."""
+        return ()
+
+    def penalty(self, samples: RaySamples, context: Context) -> Tensor:
+        """Scalar from the samples of a batch, without the weight."""
+        return torch.zeros(())
+
+    def grid_penalty(self, grids: Sequence[Grid], context: Context) -> Tensor:
+        """Scalar from the raw grids of the site, without the weight."""
+        return torch.zeros(())
+
+    def local_terms(self, grids: Sequence[Grid], context: Context) -> list[LocalTerm]:
+        """The grid penalty as closed forms per parameter, without the weight, or [] if it has none."""
+        return []
+
+    # --- samples, data, sampling, optimizer ----------------------------------------------------------------------
+
+    def on_samples(self, samples: RaySamples, context: Context) -> RaySamples:
+        """The samples that the loss and the compositing get to see."""
+        return samples
+
+    def background(
+        self, count: int, default: Tensor | None, generator: torch.Generator, context: Context
+    ) -> Tensor | None:
+        """Background colours `(count, 3)` of a batch of training rays, or the default `(3,)`, or None."""
+        return default
+
+    def near_far(self, near: Tensor, far: Tensor, context: Context) -> tuple[Tensor, Tensor]:
+        """Interval of the training rays, world units, shapes `(R,)`."""
+        return near, far
+
+    def parameter_groups(
+        self, groups: list[dict[str, Any]], grids: Sequence[Grid], context: Context
+    ) -> list[dict[str, Any]]:
+        """Optimizer parameter groups, split or changed. Asked whenever an optimizer is made."""
+        return groups
+
+    def update_groups(self, groups: list[dict[str, Any]], grids: Sequence[Grid], context: Context) -> None:
+        """Bring schedule-driven entries of the optimizer's groups up to date, in place. Asked at each step."""
+
+    # --- telling -------------------------------------------------------------------------------------------------
+
+    def value(self, context: Context) -> float:
+        """One number for tables and curves: by default the weight now."""
+        return context.at(getattr(self, "weight", float("nan"))) if hasattr(self, "weight") else 1.0
+
+    @classmethod
+    def examples(cls, site: SiteLike) -> list[Regularizer]:
+        """Instances for the contract suite, at `site` where the class takes one. Every registered class has some."""
+        return []
+
+
+RegularizerClass = TypeVar("RegularizerClass", bound=type[Regularizer])
+
+REGISTRY: dict[str, type[Regularizer]] = {}
+"""Regularizer classes by name: what configurations and the contract suite know."""
+
+
+def register(cls: RegularizerClass) -> RegularizerClass:
+    """Class decorator: make a regularizer known to `from_config` and to the contract suite under its class name.
+
+    Raises:
+        InputError: not a frozen dataclass, or it does not override `examples`.
+    """
+    if not is_dataclass(cls) or not cls.__dataclass_params__.frozen:  # type: ignore[attr-defined]
+        raise InputError(
+            f"{cls.__name__}: a regularizer is a frozen dataclass; put @dataclass(frozen=True) below"
+        )
+    if not overrides(cls, "examples"):
+        raise InputError(f"{cls.__name__}: a registered regularizer has a classmethod examples(site) -> list")
+    REGISTRY[cls.__name__] = cls
+    return cls
+
+
+def overrides(regularizer: Regularizer | type[Regularizer], part: str) -> bool:
+    """Whether a regularizer plays a part, that is, its class overrides the method of that name."""
+    cls = regularizer if isinstance(regularizer, type) else type(regularizer)
+    own, default = getattr(cls, part), getattr(Regularizer, part)
+    return getattr(own, "__func__", own) is not getattr(default, "__func__", default)
+
+
+def check_weight(value: object) -> None:
+    """Refuse negative, NaN or infinite weights; a schedule is checked when it is read."""
+    check_numeric("weight", value, low=0.0)
+
+
+def check_site(value: object) -> None:
+    """Refuse what is not a site.
+
+    Raises:
+        InputError: naming the value and the four ways to name a site.
+    """
+    if not isinstance(value, (str, Selector, Site)):
+        raise InputError(
+            f"site={value!r}: expected the name of a declared site, gridreg.parameters(...), outputs(...) or inputs(...)"
+        )
