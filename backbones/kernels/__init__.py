@@ -1,0 +1,7 @@
+"""The inner loops of our fields: plain PyTorch versions, compiled ones for the CPU, and the choice between them."""
+
+from __future__ import annotations
+
+from backbones.kernels.dispatch import cp_density, cp_features, vm_density, vm_features
+
+__all__ = ["cp_density", "cp_features", "vm_density", "vm_features"]
