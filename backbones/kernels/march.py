@@ -6,37 +6,56 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
-from numba import njit, prange
 from torch import Tensor
 
+from backbones.kernels.compiler import (
+    cube,
+    exact,
+    float32,
+    int64,
+    kernel,
+    matrix,
+    next_task,
+    real,
+    uint8,
+    vector,
+)
+from backbones.kernels.threading import launch
 from gridreg.rendering.plain import CELL_TOLERANCE, steps_bound
 
 __all__ = ["march"]
-
-Array = npt.NDArray[Any]
 
 # Edge, in cells, of the blocks that are skipped whole when nothing in them is occupied.
 _COARSE = np.uint32(4)
 _TOLERANCE = np.float32(CELL_TOLERANCE)
 # Relative rounding of a position computed in float32 by a handful of operations, with room to spare.
 _ROUNDING = np.float32(2e-6)
-_ONE = np.uint64(1)
+_ONE = np.int64(1)
+_REST = np.int64(2**63 - 1)
+_ZERO_F, _ONE_F = np.float32(0), np.float32(1)
+_INFINITE = np.float32(np.inf)
+# Rays of one task.
+_RAYS = 32
 
 
-@njit(parallel=True, cache=True)
-def _coarsen(cells: Array, coarse: Array) -> None:
-    """Mark the blocks of ``_COARSE^3`` cells in which any cell is occupied."""
+@kernel
+def _coarsen(table: Any) -> None:
+    """Mark the blocks of ``_COARSE^3`` cells in which any cell is occupied; a task is one slab of blocks."""
+    cells, coarse, columns = cube(table, 0, uint8), cube(table, 1, uint8), matrix(table, 2, uint8)
     nx, ny, nz = cells.shape
-    for a in prange(coarse.shape[0]):
-        column = np.empty(nz, np.uint8)
+    while True:
+        a = next_task(table)
+        if a < 0:
+            break
+        column = columns[a]
         for b in range(coarse.shape[1]):
             column[:] = 0
             for i in range(a * _COARSE, min(nx, (a + 1) * _COARSE)):
                 for j in range(b * _COARSE, min(ny, (b + 1) * _COARSE)):
+                    row = cells[i, j]
                     for k in range(nz):
-                        column[k] |= cells[i, j, k]
+                        column[k] |= row[k]
             for c in range(coarse.shape[2]):
                 occupied = False
                 for k in range(c * _COARSE, min(nz, (c + 1) * _COARSE)):
@@ -44,7 +63,7 @@ def _coarsen(cells: Array, coarse: Array) -> None:
                 coarse[a, b, c] = occupied
 
 
-@njit(cache=True)
+@exact
 def _slab(origin: Any, direction: Any, far: Any, lower: Any, scale: Any, edge: Any) -> tuple[Any, Any, Any]:
     """Of one axis: which face of a cell the ray leaves by, and a distance before it as ``(i - at) * rate``.
 
@@ -54,109 +73,128 @@ def _slab(origin: Any, direction: Any, far: Any, lower: Any, scale: Any, edge: A
     speed = direction * scale
     slack = _ROUNDING * (scale * (abs(origin) + abs(lower) + abs(far * direction)) + edge)
     if speed > 0:
-        return np.float32(1), start + slack, np.float32(1) / speed
+        return _ONE_F, start + slack, _ONE_F / speed
     if speed < 0:
-        return np.float32(0), start - slack, np.float32(1) / speed
-    return np.float32(0), np.float32(-1), np.float32(np.inf)
+        return _ZERO_F, start - slack, _ONE_F / speed
+    return _ZERO_F, -_ONE_F, _INFINITE
 
 
-# No fastmath here: contracted or reordered arithmetic would move samples across cell faces.
-@njit(parallel=True, cache=True)
-def _mark(
-    origins: Array,
-    directions: Array,
-    t_min: Array,
-    t_max: Array,
-    step: Any,
-    cells: Array,
-    coarse: Array,
-    lower: Array,
-    scale: Array,
-    jitter: Array,
-    bits: Array,
-    counts: Array,
-) -> None:
-    """Set the bit of every kept lattice index of every ray; counts how many."""
+# `exact`, as contracted or reordered arithmetic would move samples across cell faces.
+@exact
+def _mark_ray(
+    o: Any, d: Any, near: Any, far: Any, shift: Any, step: Any, cells: Any, coarse: Any, box: Any, bits: Any
+) -> int:
+    """Set the bits of the kept lattice indices of one ray and return their number."""
     nx, ny, nz = cells.shape
-    sx, sy, sz = scale[0], scale[1], scale[2]
-    lx, ly, lz = lower[0], lower[1], lower[2]
     edge_x, edge_y, edge_z = np.float32(nx), np.float32(ny), np.float32(nz)
     limit_x, limit_y, limit_z = edge_x + _TOLERANCE, edge_y + _TOLERANCE, edge_z + _TOLERANCE
-    steps = bits.shape[1] * 64
+    ox, oy, oz = o[0], o[1], o[2]
+    dx, dy, dz = d[0], d[1], d[2]
+    lx, ly, lz = box[0, 0], box[0, 1], box[0, 2]
+    sx, sy, sz = box[1, 0], box[1, 1], box[1, 2]
+    face_x, at_x, rate_x = _slab(ox, dx, far, lx, sx, edge_x)
+    face_y, at_y, rate_y = _slab(oy, dy, far, ly, sy, edge_y)
+    face_z, at_z, rate_z = _slab(oz, dz, far, lz, sz, edge_z)
+    steps = bits.shape[0] * 64
     per_step = 1 / np.float64(step)
-    zero = np.float32(0)
-    one = np.float32(1)
-    for ray in prange(origins.shape[0]):
-        ox, oy, oz = origins[ray, 0], origins[ray, 1], origins[ray, 2]
-        dx, dy, dz = directions[ray, 0], directions[ray, 1], directions[ray, 2]
-        near, far, shift = t_min[ray], t_max[ray], jitter[ray]
-        face_x, at_x, rate_x = _slab(ox, dx, far, lx, sx, edge_x)
-        face_y, at_y, rate_y = _slab(oy, dy, far, ly, sy, edge_y)
-        face_z, at_z, rate_z = _slab(oz, dz, far, lz, sz, edge_z)
-        count = 0
-        index = 0
-        while index < steps:
-            t = near + (np.float32(index) + shift) * step
-            if not t < far:
-                break
-            x, y, z = ((ox + t * dx) - lx) * sx, ((oy + t * dy) - ly) * sy, ((oz + t * dz) - lz) * sz
-            index += 1
-            below = (x < -_TOLERANCE) | (y < -_TOLERANCE) | (z < -_TOLERANCE)
-            if below | (not ((x <= limit_x) & (y <= limit_y) & (z <= limit_z))):
-                continue
-            # Unsigned, so that indexing has no branch for negative numbers.
-            i = np.uint32(min(max(x, zero), edge_x - one))
-            j = np.uint32(min(max(y, zero), edge_y - one))
-            k = np.uint32(min(max(z, zero), edge_z - one))
-            if cells[i, j, k]:
-                bits[ray, (index - 1) >> 6] |= _ONE << np.uint64((index - 1) & 63)
-                count += 1
-                continue
-            size = one
-            if not coarse[i // _COARSE, j // _COARSE, k // _COARSE]:
-                size = np.float32(_COARSE)
-                i, j, k = i // _COARSE * _COARSE, j // _COARSE * _COARSE, k // _COARSE * _COARSE
-            leave = (np.float32(i) + face_x * size - at_x) * rate_x
-            leave = min(leave, (np.float32(j) + face_y * size - at_y) * rate_y)
-            leave = min(leave, (np.float32(k) + face_z * size - at_z) * rate_z)
-            last = (np.float64(leave) - near) * per_step - shift
-            if last >= index:
-                index = int(min(last, np.float64(steps))) + 1
-        counts[ray] = count
+    count = 0
+    index = 0
+    while index < steps:
+        t = near + (np.float32(index) + shift) * step
+        if not t < far:
+            break
+        x, y, z = ((ox + t * dx) - lx) * sx, ((oy + t * dy) - ly) * sy, ((oz + t * dz) - lz) * sz
+        index += 1
+        below = (x < -_TOLERANCE) | (y < -_TOLERANCE) | (z < -_TOLERANCE)
+        if below | (not ((x <= limit_x) & (y <= limit_y) & (z <= limit_z))):
+            continue
+        # Unsigned, so that indexing has no branch for negative numbers.
+        i = np.uint32(min(max(x, _ZERO_F), edge_x - _ONE_F))
+        j = np.uint32(min(max(y, _ZERO_F), edge_y - _ONE_F))
+        k = np.uint32(min(max(z, _ZERO_F), edge_z - _ONE_F))
+        if cells[i, j, k]:
+            bits[(index - 1) >> 6] |= _ONE << ((index - 1) & 63)
+            count += 1
+            continue
+        size = _ONE_F
+        if not coarse[i // _COARSE, j // _COARSE, k // _COARSE]:
+            size = np.float32(_COARSE)
+            i, j, k = i // _COARSE * _COARSE, j // _COARSE * _COARSE, k // _COARSE * _COARSE
+        leave = (np.float32(i) + face_x * size - at_x) * rate_x
+        leave = min(leave, (np.float32(j) + face_y * size - at_y) * rate_y)
+        leave = min(leave, (np.float32(k) + face_z * size - at_z) * rate_z)
+        last = (np.float64(leave) - near) * per_step - shift
+        if last >= index:
+            index = int(min(last, np.float64(steps))) + 1
+    return count
 
 
-@njit(parallel=True, cache=True)
-def _fill(
-    origins: Array,
-    directions: Array,
-    t_min: Array,
-    step: Any,
-    jitter: Array,
-    bits: Array,
-    offsets: Array,
-    index: Array,
-    ts: Array,
-    positions: Array,
+@kernel
+def _mark(table: Any) -> None:
+    """Find the samples of blocks of rays: bits of their lattice indices, and their counts."""
+    o, d = matrix(table, 0, float32), matrix(table, 1, float32)
+    near, far, shift = vector(table, 2, float32), vector(table, 3, float32), vector(table, 4, float32)
+    step = real(table, 5)
+    cells, coarse, box = cube(table, 6, uint8), cube(table, 7, uint8), matrix(table, 8, float32)
+    bits, counts = matrix(table, 9, int64), vector(table, 10, int64)
+    while True:
+        task = next_task(table)
+        if task < 0:
+            break
+        for ray in range(task * _RAYS, min((task + 1) * _RAYS, o.shape[0])):
+            counts[ray] = _mark_ray(
+                o[ray], d[ray], near[ray], far[ray], shift[ray], step, cells, coarse, box, bits[ray]
+            )
+
+
+@exact
+def _fill_ray(
+    o: Any, d: Any, near: Any, shift: Any, step: Any, bits: Any, index: Any, t: Any, x: Any
 ) -> None:
-    """Write out the marked samples."""
-    for ray in prange(origins.shape[0]):
-        n = offsets[ray]
-        end = offsets[ray + 1]
-        word = 0
-        while n < end:
-            rest = bits[ray, word]
-            i = word * 64
-            while rest != 0:
-                if rest & _ONE:
-                    t = t_min[ray] + (np.float32(i) + jitter[ray]) * step
-                    index[n] = i
-                    ts[n] = t
-                    for axis in range(3):
-                        positions[n, axis] = origins[ray, axis] + t * directions[ray, axis]
-                    n += 1
-                rest >>= _ONE
-                i += 1
-            word += 1
+    """Write out the samples of one ray."""
+    n = 0
+    for word in range(bits.shape[0]):
+        rest = bits[word]
+        i = word * 64
+        while rest != 0:
+            if rest & 1:
+                distance = near + (np.float32(i) + shift) * step
+                index[n] = i
+                t[n] = distance
+                x[n, 0] = o[0] + distance * d[0]
+                x[n, 1] = o[1] + distance * d[1]
+                x[n, 2] = o[2] + distance * d[2]
+                n += 1
+            # The sign bit would be shifted in for ever.
+            rest = (rest >> 1) & _REST
+            i += 1
+
+
+@kernel
+def _fill(table: Any) -> None:
+    """Write out the marked samples of blocks of rays."""
+    o, d = matrix(table, 0, float32), matrix(table, 1, float32)
+    near, shift, step = vector(table, 2, float32), vector(table, 3, float32), real(table, 4)
+    bits, offsets = matrix(table, 5, int64), vector(table, 6, int64)
+    index, t, x = vector(table, 7, int64), vector(table, 8, float32), matrix(table, 9, float32)
+    while True:
+        task = next_task(table)
+        if task < 0:
+            break
+        for ray in range(task * _RAYS, min((task + 1) * _RAYS, o.shape[0])):
+            first, end = offsets[ray], offsets[ray + 1]
+            if first < end:
+                _fill_ray(
+                    o[ray],
+                    d[ray],
+                    near[ray],
+                    shift[ray],
+                    step,
+                    bits[ray],
+                    index[first:end],
+                    t[first:end],
+                    x[first:end],
+                )
 
 
 @torch.no_grad()
@@ -181,26 +219,25 @@ def march(
     if steps == 0:
         offsets, empty = torch.zeros(rays + 1, dtype=torch.int64), torch.zeros(0)
         return offsets, offsets[:0].clone(), empty, empty.reshape(0, 3)
-    o, d = origins.contiguous().numpy(), directions.contiguous().numpy()
-    near, far = t_min.contiguous().numpy(), t_max.contiguous().numpy()
-    shift = torch.as_tensor(jitter, dtype=torch.float32).expand(rays).contiguous().numpy()
-    grid = cells.contiguous().view(torch.uint8).numpy()
-    lower = bounds[0].contiguous().numpy()
-    scale = (torch.tensor(cells.shape).float() / (bounds[1] - bounds[0])).numpy()
-    coarse = np.empty([(n + int(_COARSE) - 1) // int(_COARSE) for n in grid.shape], np.uint8)
-    bits = np.zeros((rays, (steps + 63) // 64), np.uint64)
-    counts = np.empty(rays, np.int64)
-    length = np.float32(step)
+    o, d, near, far = (x.contiguous() for x in (origins, directions, t_min, t_max))
+    shift = torch.as_tensor(jitter, dtype=torch.float32).expand(rays).contiguous()
+    grid = cells.contiguous().view(torch.uint8)
+    shape = torch.tensor(grid.shape)
+    box = torch.stack([bounds[0], shape.to(bounds.dtype) / (bounds[1] - bounds[0])])
+    coarse = torch.empty(*(-(-n // int(_COARSE)) for n in grid.shape), dtype=torch.uint8)
+    columns = torch.empty(coarse.shape[0], grid.shape[2], dtype=torch.uint8)
+    bits, counts = torch.zeros(rays, -(-steps // 64), dtype=torch.int64), torch.empty(rays, dtype=torch.int64)
+    tasks = -(-rays // _RAYS)
 
-    _coarsen(grid, coarse)
-    _mark(o, d, near, far, length, grid, coarse, lower, scale, shift, bits, counts)
+    launch(_coarsen, coarse.shape[0], grid, coarse, columns)
+    launch(_mark, tasks, o, d, near, far, shift, step, grid, coarse, box, bits, counts)
     offsets = torch.zeros(rays + 1, dtype=torch.int64)
-    torch.cumsum(torch.from_numpy(counts), 0, out=offsets[1:])
+    torch.cumsum(counts, 0, out=offsets[1:])
     samples = int(offsets[-1])
     index, t, positions = (
         torch.empty(samples, dtype=torch.int64),
         torch.empty(samples),
         torch.empty(samples, 3),
     )
-    _fill(o, d, near, length, shift, bits, offsets.numpy(), index.numpy(), t.numpy(), positions.numpy())
+    launch(_fill, tasks if samples else 0, o, d, near, shift, step, bits, offsets, index, t, positions)
     return offsets, index, t, positions

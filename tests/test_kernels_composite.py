@@ -1,0 +1,136 @@
+"""Compiled compositing against the plain versions: values, gradients, and no dependence on threads."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from backbones.kernels import composite
+from gridreg.rendering import backends, plain
+
+counts_lists = st.lists(st.sampled_from([0, 0, 1, 2, 7, 40]), max_size=150)
+
+
+def random_packed(seed: int, counts: list[int], channels: int = 3):
+    g = torch.Generator().manual_seed(seed)
+    offsets = torch.tensor([0, *counts]).cumsum(0)
+    samples = int(offsets[-1])
+    tau = torch.rand(samples, generator=g) ** 4 * 3
+    return tau, torch.rand(samples, channels, generator=g), offsets
+
+
+def gradients(outputs, inputs, seed: int):
+    g = torch.Generator().manual_seed(seed)
+    return torch.autograd.grad(outputs, inputs, torch.randn(outputs.shape, generator=g).to(outputs.dtype))
+
+
+@settings(max_examples=60, deadline=None)
+@given(counts=counts_lists, seed=st.integers(0, 2**31))
+def test_weights(counts, seed):
+    tau, _, offsets = random_packed(seed, counts)
+    tau.requires_grad_()
+    exact = tau.detach().double().requires_grad_()
+    found, expected = composite.composite_weights(tau, offsets), plain.composite_weights(exact, offsets)
+    torch.testing.assert_close(found, expected.float(), rtol=1e-5, atol=1e-12)
+    (a,), (b,) = gradients(found, (tau,), seed), gradients(expected, (exact,), seed)
+    torch.testing.assert_close(a, b.float(), rtol=1e-4, atol=1e-5)
+
+
+@settings(max_examples=60, deadline=None)
+@given(counts=counts_lists, seed=st.integers(0, 2**31), channels=st.integers(0, 9))
+def test_sums(counts, seed, channels):
+    weights, values, offsets = random_packed(seed, counts, channels)
+    weights.requires_grad_()
+    values.requires_grad_()
+    found, expected = (
+        composite.accumulate(weights, values, offsets),
+        plain.accumulate(weights, values, offsets),
+    )
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
+    for a, b in zip(
+        gradients(found, (weights, values), seed), gradients(expected, (weights, values), seed), strict=True
+    ):
+        torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-6)
+
+
+@settings(max_examples=60, deadline=None)
+@given(counts=counts_lists, seed=st.integers(0, 2**31), bound=st.sampled_from([0.0, 1e-4, 0.013, 0.5, 1.0]))
+def test_terminate(counts, seed, bound):
+    tau, _, offsets = random_packed(seed, counts)
+    found, expected = composite.terminate(tau, offsets, bound), plain.terminate(tau, offsets, bound)
+    assert found.dtype == torch.bool
+    before = torch.exp(-plain._depth_before(tau.double(), offsets))
+    undecided = (before - bound).abs() <= 1e-5 * bound
+    assert torch.equal(found | undecided, expected | undecided)
+    assert bool(found.all()) or bound > 0
+
+
+def test_only_the_wanted_gradient():
+    weights, values, offsets = random_packed(0, [3, 0, 4])
+    for wanted in (weights, values):
+        wanted.requires_grad_()
+        (found,) = gradients(composite.accumulate(weights, values, offsets), (wanted,), 0)
+        (expected,) = gradients(plain.accumulate(weights, values, offsets), (wanted,), 0)
+        torch.testing.assert_close(found, expected)
+        wanted.requires_grad_(False)
+    assert not composite.accumulate(weights, values, offsets).requires_grad
+
+
+def test_opaque_and_strided():
+    tau = torch.tensor([[0.5, 9.0], [math.inf, 9.0], [1.0, 9.0], [2.0, 9.0]])[:, 0].requires_grad_()
+    offsets = torch.tensor([[0, 0], [3, 0], [4, 0]])[:, 0]
+    found, expected = composite.composite_weights(tau, offsets), plain.composite_weights(tau, offsets)
+    torch.testing.assert_close(found, expected)
+    torch.testing.assert_close(gradients(found, (tau,), 0), gradients(expected, (tau,), 0))
+    spread = torch.ones(1, 1).expand(4, 3)
+    torch.testing.assert_close(
+        composite.accumulate(found, spread, offsets), plain.accumulate(expected, spread, offsets)
+    )
+
+
+def test_inputs_stay_as_they_were():
+    tau, values, offsets = random_packed(0, [30] * 9)
+    copies = tau.clone(), values.clone(), offsets.clone()
+    composite.accumulate(composite.composite_weights(tau, offsets), values, offsets)
+    composite.terminate(tau, offsets, 0.1)
+    for a, b in zip((tau, values, offsets), copies, strict=True):
+        assert torch.equal(a, b)
+
+
+def test_thread_count_does_not_matter():
+    tau, values, offsets = random_packed(7, [13, 0, 55] * 200)
+    tau.requires_grad_()
+    values.requires_grad_()
+    threads = torch.get_num_threads()
+
+    def everything():
+        weights = composite.composite_weights(tau, offsets)
+        sums = composite.accumulate(weights, values, offsets)
+        return weights, sums, composite.terminate(tau, offsets, 0.3), *gradients(sums, (tau, values), 1)
+
+    try:
+        torch.set_num_threads(1)
+        alone = everything()
+        torch.set_num_threads(2)
+        for a, b in zip(everything(), alone, strict=True):
+            assert torch.equal(a, b)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def test_register(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(backends, "_BACKENDS", {"torch": backends._BACKENDS["torch"]})
+    composite.register()
+    tau, values, offsets = random_packed(7, [5, 0, 9])
+    weights = backends.composite_weights(tau, offsets)
+    assert torch.equal(weights, composite.composite_weights(tau, offsets))
+    with backends.use_backend("torch"):
+        assert torch.equal(backends.composite_weights(tau, offsets), plain.composite_weights(tau, offsets))
+    assert torch.equal(
+        backends.accumulate(weights, values, offsets), composite.accumulate(weights, values, offsets)
+    )
+    assert torch.equal(backends.terminate(tau, offsets, 0.4), composite.terminate(tau, offsets, 0.4))
