@@ -1,0 +1,142 @@
+"""From densities on a lattice to a closed triangle mesh (marching cubes, Lorensen and Cline 1987)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage, sparse  # type: ignore[import-untyped]
+from skimage.measure import marching_cubes
+
+from gridreg.export.volume import DensityVolume
+
+__all__ = ["drop_small_components", "face_areas", "polygonise", "vertex_normals"]
+
+Vertices = NDArray[np.float64]
+Faces = NDArray[np.int64]
+Density = Callable[[Vertices], NDArray[np.float32]]
+
+# Vertices keep this share of an edge away from its ends: closer, neighbouring vertices would fall together.
+_MARGIN = 0.02
+
+
+def polygonise(
+    volume: DensityVolume,
+    threshold: float,
+    density: Density | None = None,
+    *,
+    refine: int = 8,
+    fill_cavities: bool = True,
+) -> tuple[Vertices, Faces]:
+    """Closed surface around the densities above a threshold.
+
+    One empty layer around the lattice closes surfaces at the faces of the box. Marching cubes runs on
+    ``density / (density + threshold)`` at 1/2: the same level set, but a density spans orders of magnitude
+    between two nodes, and linear interpolation of it would stick every vertex to the emptier node. The
+    vertices then move along their lattice edges to where the density itself crosses the threshold, found by
+    bisection.
+
+    Args:
+        volume: densities at lattice nodes.
+        threshold: density per world unit, above 0.
+        density: world positions ``(N, 3)`` to densities ``(N,)``, 0 outside the box; None: no bisection.
+        refine: bisection steps; the vertices are then within ``2**-(refine + 1)`` of a lattice edge, but for
+            the share of 0.02 that they keep from its ends.
+        fill_cavities: leave out surfaces that are closed off from the outside.
+
+    Returns:
+        Vertices ``(V, 3)`` in world units and faces ``(F, 3)``, counterclockwise seen from outside; both
+        empty when no node is above the threshold.
+    """
+    values = np.pad(volume.values, 1)
+    solid = values >= threshold
+    if not solid.any():
+        return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
+    level = values / (values + np.float32(threshold))
+    # A node right on the level would give several vertices in one place.
+    level = np.where(solid, np.maximum(level, 0.5 + _MARGIN), np.minimum(level, 0.5 - _MARGIN))
+    if fill_cavities:
+        air, _ = ndimage.label(~solid)
+        level[(air != air[0, 0, 0]) & ~solid] = 1.0
+    # scikit-image calls outward faces of solids with large values "ascent".
+    found, faces, _, _ = marching_cubes(  # type: ignore[no-untyped-call]
+        level.astype(np.float32), 0.5, gradient_direction="ascent"
+    )
+    index = found.astype(np.float64)
+    if density is not None and refine > 0:
+        index = _on_level(
+            index, solid, threshold, lambda i: density(volume.lower + (i - 1) * volume.spacing), refine
+        )
+    # The empty layer is a device: the surface itself ends at the box.
+    index = np.clip(index - 1, 0, np.array(volume.values.shape) - 1)
+    return volume.lower + index * volume.spacing, faces.astype(np.int64)
+
+
+def _on_level(
+    index: Vertices, solid: NDArray[np.bool_], threshold: float, density: Density, steps: int
+) -> Vertices:
+    """Move the vertices that lie on lattice edges to the crossing, bisecting between the edge's two nodes."""
+    between = np.abs(index - np.round(index)) > 1e-6
+    # Ambiguous cells also have a vertex inside: it belongs to no edge and stays.
+    moved = np.flatnonzero(between.sum(axis=1) == 1)
+    axis = between[moved].argmax(axis=1)
+    rows = np.arange(moved.size)
+    below = np.round(index[moved])
+    below[rows, axis] = np.floor(index[moved, axis])
+    step = np.zeros_like(below)
+    step[rows, axis] = 1.0
+    corner = below.astype(np.int64)
+    rising = ~solid[corner[:, 0], corner[:, 1], corner[:, 2]]
+    inside = np.where(rising, 1.0, 0.0)
+    outside = 1.0 - inside
+    for _ in range(steps):
+        middle = (inside + outside) / 2
+        hit = density(below + middle[:, None] * step) >= threshold
+        inside, outside = np.where(hit, middle, inside), np.where(hit, outside, middle)
+    place = np.clip((inside + outside) / 2, _MARGIN, 1 - _MARGIN)
+    result: Vertices = index.copy()
+    result[moved] = below + place[:, None] * step
+    return result
+
+
+def _area_vectors(vertices: Vertices, faces: Faces) -> Vertices:
+    """Outward normals of the faces ``(F, 3)``, as long as twice their areas."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    return np.cross(b - a, c - a)
+
+
+def face_areas(vertices: Vertices, faces: Faces) -> NDArray[np.float64]:
+    """Area of every face ``(F,)``, square world units."""
+    areas: NDArray[np.float64] = np.linalg.norm(_area_vectors(vertices, faces), axis=1) / 2
+    return areas
+
+
+def vertex_normals(vertices: Vertices, faces: Faces) -> Vertices:
+    """Outward unit normals ``(V, 3)``: those of the faces around each vertex, weighted by area."""
+    of_faces = _area_vectors(vertices, faces)
+    total: Vertices = np.zeros_like(vertices)
+    for corner in range(3):
+        for axis in range(3):
+            total[:, axis] += np.bincount(faces[:, corner], of_faces[:, axis], minlength=len(vertices))
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    total /= np.maximum(length, np.finfo(np.float64).tiny)
+    total[length[:, 0] == 0] = (0.0, 0.0, 1.0)
+    return total
+
+
+def drop_small_components(vertices: Vertices, faces: Faces, share: float) -> tuple[Vertices, Faces]:
+    """Keep the connected parts whose surface is at least ``share`` of the surface of the largest part.
+
+    Args:
+        vertices, faces: the mesh; at least one face.
+        share: in [0, 1]; 0 keeps everything, 1 the largest part alone.
+    """
+    pairs = np.concatenate([faces[:, :2], faces[:, 1:]])
+    graph = sparse.coo_matrix((np.ones(len(pairs), np.int8), pairs.T), shape=(len(vertices), len(vertices)))
+    _, part_of_vertex = sparse.csgraph.connected_components(graph, directed=False)
+    part = part_of_vertex[faces[:, 0]]
+    surface = np.bincount(part, face_areas(vertices, faces))
+    kept = faces[(surface >= share * surface.max())[part]]
+    used, renumbered = np.unique(kept, return_inverse=True)
+    return vertices[used], renumbered.reshape(-1, 3).astype(np.int64)

@@ -1,0 +1,244 @@
+"""A triangle mesh from a field: extraction, colours, and files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from gridreg.errors import InputError
+from gridreg.export.marching import Faces, Vertices, drop_small_components, polygonise, vertex_normals
+from gridreg.export.volume import SeenDensity, sample_density, surface_threshold
+from gridreg.rendering import Field, OccupancyGrid
+from gridreg.training.files import writing
+
+if TYPE_CHECKING:
+    import trimesh
+
+__all__ = ["MESH_SUFFIXES", "Mesh", "extract_mesh", "read_mesh", "save_mesh", "write_mesh"]
+
+MESH_SUFFIXES = (".ply", ".obj", ".glb")
+"""Formats that `save_mesh` writes, by the suffix of the file's name."""
+
+Colours = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles in world coordinates.
+
+    Args:
+        vertices: ``(V, 3)`` float64, world units.
+        faces: ``(F, 3)`` int64 vertex numbers, counterclockwise seen from outside.
+        colours: ``(V, 3)`` uint8 sRGB, or None.
+        threshold: density per world unit at which it was cut out of a field; None for a mesh from a file.
+    """
+
+    vertices: Vertices
+    faces: Faces
+    colours: Colours | None = None
+    threshold: float | None = None
+
+    @property
+    def volume(self) -> float:
+        """Signed volume, cubic world units: positive when the faces of a closed mesh look outward.
+
+        Example:
+            >>> corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+            >>> tetrahedron = Mesh(corners, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]))
+            >>> round(6 * tetrahedron.volume, 12)
+            1.0
+        """
+        a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
+        return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
+
+    @property
+    def watertight(self) -> bool:
+        """Whether every edge joins exactly two faces, which run along it in opposite directions."""
+        directed = np.concatenate([self.faces[:, [0, 1]], self.faces[:, [1, 2]], self.faces[:, [2, 0]]])
+        forwards, counts = np.unique(directed, axis=0, return_counts=True)
+        backwards = np.unique(directed[:, ::-1], axis=0)
+        return bool((counts == 1).all()) and np.array_equal(forwards, backwards)
+
+    def to_trimesh(self) -> trimesh.Trimesh:
+        """The same mesh for the trimesh library; nothing is merged or reordered."""
+        import trimesh
+
+        return trimesh.Trimesh(self.vertices, self.faces, vertex_colors=self.colours, process=False)
+
+
+def extract_mesh(
+    field: Field,
+    occupancy: OccupancyGrid | None = None,
+    *,
+    resolution: int = 256,
+    threshold: float | None = None,
+    bounds: Tensor | None = None,
+    colours: bool = True,
+    min_component: float = 0.01,
+    fill_cavities: bool = True,
+    refine: int = 8,
+    chunk: int = 1 << 18,
+) -> Mesh:
+    """Cut the surface of a field out of its density.
+
+    The surface is closed, also where the box cuts through something, and its faces look outward.
+
+    Args:
+        field: the field; what is attached to it counts.
+        occupancy: density counts only in occupied cells, as in renders; None: everywhere.
+        resolution: lattice nodes along the longest edge of the box. Memory grows with its cube: about 20
+            bytes per node, 350 MB at 256.
+        threshold: density per world unit at the surface; None: from the field, see
+            `gridreg.export.volume.surface_threshold`.
+        bounds: ``(2, 3)`` box to look in, world units; None: that of the field.
+        colours: whether to colour the vertices, as the field is seen along the inward normal.
+        min_component: parts with less surface than this share of that of the largest part are dropped.
+        fill_cavities: leave out surfaces that cannot be reached from outside. What a field holds inside a
+            solid was never seen by any camera.
+        refine: bisection steps that move the vertices onto the level set.
+        chunk: positions evaluated at once.
+
+    Raises:
+        InputError: for an empty field, a threshold that nothing exceeds, or arguments out of range.
+    """
+    if threshold is not None and not 0 < threshold < float("inf"):
+        raise InputError(f"threshold={threshold}: expected a density per world unit above 0")
+    if not 0 <= min_component <= 1:
+        raise InputError(f"min_component={min_component}: expected a share in [0, 1]")
+    if refine < 0:
+        raise InputError(f"refine={refine}: expected a number of bisection steps, at least 0")
+    density = SeenDensity(field, occupancy, chunk)
+    box = field.bounds if bounds is None else bounds.to(field.bounds)
+    volume = sample_density(density, box, resolution)
+    level = surface_threshold(volume) if threshold is None else threshold
+
+    def inside_box(positions: Vertices) -> NDArray[np.float32]:
+        x = torch.from_numpy(positions).to(box)
+        outside = ((x < box[0]) | (x > box[1])).any(dim=-1)
+        return density(x).masked_fill(outside, 0.0).cpu().numpy()
+
+    vertices, faces = polygonise(volume, level, inside_box, refine=refine, fill_cavities=fill_cavities)
+    if not len(faces):
+        raise InputError(
+            f"threshold={level:.6g}: the largest density in the box is {float(volume.values.max()):.6g} "
+            "per world unit, expected a threshold below it"
+        )
+    vertices, faces = drop_small_components(vertices, faces, min_component)
+    seen = None
+    if colours:
+        depth = float(volume.spacing.mean())
+        seen = _vertex_colours(field, density, vertices, vertex_normals(vertices, faces), depth, chunk)
+    return Mesh(vertices, faces, seen, level)
+
+
+@torch.no_grad()
+def _vertex_colours(
+    field: Field, density: SeenDensity, vertices: Vertices, normals: Vertices, depth: float, chunk: int
+) -> Colours:
+    """Colours along a short ray through each vertex, from one lattice cell outside to three inside.
+
+    A surface has a thickness: the colour right at the level set, in front of what the training pixels were
+    made of, is hardly trained. The ray is composited as in renders and divided by its opacity.
+    """
+    steps = torch.arange(8, dtype=field.bounds.dtype, device=field.bounds.device) * 0.5 - 0.75
+    result = np.empty((len(vertices), 3), dtype=np.uint8)
+    count = max(1, chunk // len(steps))
+    for start in range(0, len(vertices), count):
+        part = slice(start, start + count)
+        x = torch.from_numpy(vertices[part]).to(field.bounds)
+        inward = -torch.from_numpy(normals[part]).to(field.bounds)
+        positions = x[:, None] + steps[:, None] * depth * inward[:, None]
+        sigma = density(positions.reshape(-1, 3)).reshape(len(x), len(steps))
+        tau = sigma * (0.5 * depth)
+        weights = torch.exp(tau - tau.cumsum(dim=1)) * -torch.expm1(-tau)
+        # Where nothing stops the ray (a corner of the box), the vertex itself decides.
+        blank = weights.sum(dim=1) < 1e-6
+        weights = weights / weights.sum(dim=1, keepdim=True).clamp(min=1e-6)
+        ray, sample = (weights > 1e-3).nonzero(as_tuple=True)
+        seen = field.colour(positions[ray, sample], inward[ray]) * weights[ray, sample][:, None]
+        total = torch.zeros_like(x).index_add(0, ray, seen.to(x.dtype))
+        total[blank] = field.colour(x[blank], inward[blank]).to(x.dtype)
+        result[part] = (total.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
+    return result
+
+
+def _check_suffix(path: Path) -> None:
+    if path.suffix.lower() not in MESH_SUFFIXES:
+        raise InputError(f"{path}: found suffix {path.suffix!r}, expected one of {', '.join(MESH_SUFFIXES)}")
+
+
+def save_mesh(mesh: Mesh, path: str | Path) -> None:
+    """Write a mesh as PLY (binary), OBJ or GLB, by the suffix; whole or not at all.
+
+    Coordinates are those of the world in every format: a GLB viewer that takes y for up shows a z-up scene
+        lying.
+
+    Raises:
+        InputError: for another suffix, or if the place is not writable or the disk is full.
+    """
+    path = Path(path)
+    _check_suffix(path)
+    with writing(path) as temporary:
+        mesh.to_trimesh().export(temporary, file_type=path.suffix.lower()[1:])
+
+
+def write_mesh(
+    field: Field,
+    path: str | Path,
+    occupancy: OccupancyGrid | None = None,
+    *,
+    resolution: int = 256,
+    **options: Any,
+) -> Mesh:
+    """`extract_mesh` and `save_mesh` in one.
+
+    Args:
+        field: the field.
+        path: file to write; its suffix chooses the format.
+        occupancy: as for `extract_mesh`.
+        resolution: as for `extract_mesh`.
+        options: further arguments of `extract_mesh`.
+
+    Raises:
+        InputError: of either.
+    """
+    # Before minutes of work, not after.
+    _check_suffix(Path(path))
+    mesh = extract_mesh(field, occupancy, resolution=resolution, **options)
+    save_mesh(mesh, path)
+    return mesh
+
+
+def read_mesh(path: str | Path) -> Mesh:
+    """Read a triangle mesh in any format that trimesh reads; the parts of a scene become one mesh.
+
+    Raises:
+        InputError: if there is no such file, it is not a mesh, or it holds no faces.
+    """
+    import trimesh
+
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such mesh file")
+    try:
+        loaded = trimesh.load_mesh(path, process=False)
+        mesh = loaded.to_mesh() if isinstance(loaded, trimesh.Scene) else loaded
+        vertices = np.asarray(mesh.vertices, dtype=np.float64)
+        faces = np.asarray(mesh.faces, dtype=np.int64)
+    # The readers of trimesh raise whatever their formats make them raise.
+    except Exception as error:
+        text = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(f"{path}: cannot be read as a triangle mesh: {text}") from error
+    if not len(faces) or not np.isfinite(vertices).all():
+        raise InputError(f"{path}: found {len(faces)} faces, expected a triangle mesh with finite corners")
+    colours = None
+    visual: Any = mesh.visual
+    if visual.kind == "vertex":
+        colours = np.asarray(visual.vertex_colors, dtype=np.uint8)[:, :3]
+    return Mesh(vertices, faces, colours)

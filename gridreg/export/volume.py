@@ -1,0 +1,150 @@
+"""The density of a field on a regular lattice, and the threshold at which its surface is seen."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from gridreg.errors import InputError
+from gridreg.rendering import Field, OccupancyGrid
+
+__all__ = ["DensityVolume", "SeenDensity", "sample_density", "surface_threshold"]
+
+Array = NDArray[np.float32]
+
+
+class SeenDensity:
+    """The density as the renderer sees it: that of the field inside occupied cells, 0 elsewhere.
+
+    Args:
+        field: density per world unit.
+        occupancy: cells that may hold something; None: everywhere.
+        chunk: positions evaluated at once; it bounds the memory and changes no value.
+    """
+
+    def __init__(self, field: Field, occupancy: OccupancyGrid | None = None, chunk: int = 1 << 18) -> None:
+        if chunk < 1:
+            raise InputError(f"chunk={chunk}: expected at least 1 position")
+        self.field, self.occupancy, self.chunk = field, occupancy, chunk
+
+    @torch.no_grad()
+    def __call__(self, positions: Tensor) -> Tensor:
+        """World positions ``(N, 3)`` to densities ``(N,)`` per world unit.
+
+        Raises:
+            InputError: if the field gives a density that is not finite.
+        """
+        found = torch.zeros(positions.shape[0], dtype=positions.dtype, device=positions.device)
+        for start in range(0, positions.shape[0], self.chunk):
+            part = positions[start : start + self.chunk]
+            kept = torch.arange(part.shape[0], device=part.device)
+            if self.occupancy is not None:
+                kept = self.occupancy.contains(part).nonzero().squeeze(-1)
+            if kept.numel():
+                found[start + kept] = self.field.density(part[kept]).to(found.dtype)
+        broken = int((~torch.isfinite(found)).sum())
+        if broken:
+            raise InputError(f"field: its density is not finite at {broken} of {found.shape[0]} positions")
+        return found
+
+
+@dataclass(frozen=True)
+class DensityVolume:
+    """Densities at lattice nodes; node ``(i, j, k)`` lies at ``lower + (i, j, k) * spacing``.
+
+    Args:
+        values: ``(X, Y, Z)`` float32, per world unit.
+        lower: ``(3,)`` position of node 0, world units.
+        spacing: ``(3,)`` distance between nodes, world units.
+    """
+
+    values: Array
+    lower: NDArray[np.float64]
+    spacing: NDArray[np.float64]
+
+
+def lattice_nodes(bounds: Tensor, resolution: int) -> tuple[int, int, int]:
+    """Nodes along x, y, z with nearly cubic cells and ``resolution`` nodes along the longest edge.
+
+    Example:
+        >>> lattice_nodes(torch.tensor([[0.0, 0.0, 0.0], [2.0, 1.0, 0.5]]), 9)
+        (9, 5, 3)
+    """
+    size = (bounds[1] - bounds[0]).double()
+    cell = float(size.max()) / (resolution - 1)
+    x, y, z = (max(2, round(float(edge) / cell) + 1) for edge in size)
+    return x, y, z
+
+
+def sample_density(density: SeenDensity, bounds: Tensor, resolution: int) -> DensityVolume:
+    """Evaluate a density at the nodes of a lattice whose outer nodes lie on the faces of a box.
+
+    Args:
+        density: what to evaluate, in chunks of its own size.
+        bounds: ``(2, 3)`` corners of the box, world units.
+        resolution: nodes along the longest edge, at least 2.
+
+    Raises:
+        InputError: for a resolution below 2, a box without volume, or a density that is not finite.
+    """
+    if resolution < 2:
+        raise InputError(f"resolution={resolution}: expected at least 2 nodes along the longest edge")
+    if tuple(bounds.shape) != (2, 3) or not bool((bounds[1] > bounds[0]).all()):
+        raise InputError(f"bounds={bounds.tolist()}: expected a lower and a larger upper corner")
+    counts = lattice_nodes(bounds, resolution)
+    axes = []
+    for axis, count in enumerate(counts):
+        nodes = torch.linspace(
+            float(bounds[0, axis]), float(bounds[1, axis]), count, dtype=torch.float64, device=bounds.device
+        )
+        # A node a rounding error outside of the box would be empty and open the surface there.
+        axes.append(nodes.to(bounds.dtype).clamp(bounds[0, axis], bounds[1, axis]))
+    values = np.empty(counts, dtype=np.float32)
+    per_layer = counts[1] * counts[2]
+    layers = max(1, density.chunk // per_layer)
+    for start in range(0, counts[0], layers):
+        mesh = torch.meshgrid(axes[0][start : start + layers], axes[1], axes[2], indexing="ij")
+        positions = torch.stack([m.reshape(-1) for m in mesh], dim=-1)
+        values[start : start + layers] = density(positions).cpu().numpy().reshape(-1, *counts[1:])
+    corners = bounds.double().cpu().numpy()
+    return DensityVolume(values, corners[0], (corners[1] - corners[0]) / (np.array(counts) - 1))
+
+
+def surface_threshold(volume: DensityVolume) -> float:
+    """Half of the density at which rays along the axes have lost half of their light.
+
+    Each ray along an axis, in both directions and through every node, has a first node at which its
+    transmittance falls to 1/2: there the surface is seen (the ray's median depth). The median of the
+    densities at these nodes, halved, is the threshold. For a solid of one density this is half of it,
+    wherever that may lie, and it does not depend on the resolution, as the density of "half opaque over one
+    voxel" does: that one makes a soft object shrink and vanish as the voxels get smaller. Haze in front of a
+    surface does not move it, because haze takes less than half of the light of most rays.
+
+    Returns:
+        Density per world unit.
+
+    Raises:
+        InputError: if no ray along an axis loses half of its light: the field is empty.
+    """
+    taking: list[Array] = []
+    strongest = 0.0
+    for axis in range(3):
+        forwards = np.moveaxis(volume.values, axis, 0)
+        for along in (forwards, forwards[::-1]):
+            depth = np.cumsum(along, axis=0, dtype=np.float32) * np.float32(volume.spacing[axis])
+            strongest = max(strongest, float(depth[-1].max()))
+            opaque = depth[-1] >= math.log(2)
+            first = np.argmax(depth >= math.log(2), axis=0)
+            taking.append(np.take_along_axis(along, first[None], axis=0)[0][opaque])
+    densities = np.concatenate(taking)
+    if not densities.size:
+        raise InputError(
+            f"field: no ray along an axis of the box is more than {-math.expm1(-strongest):.3g} opaque, "
+            "expected 0.5 for a surface; give a threshold (density per world unit) if something is there"
+        )
+    return float(np.median(densities)) / 2
