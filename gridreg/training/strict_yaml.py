@@ -1,0 +1,182 @@
+"""YAML without its traps: the scalars of YAML 1.2, no anchors, no duplicate keys, and the line of every key.
+
+PyYAML follows YAML 1.1, where ``8e-5`` is text, ``off`` is a truth value, ``010`` is eight and ``12:30`` is
+750. The loader here derives from PyYAML's ``SafeLoader`` (which builds plain data only and never runs
+anything) and reads numbers, truth values and null as YAML 1.2 does; the dumper quotes whatever either version
+would misread.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+from typing import Any, NamedTuple, NoReturn
+
+import yaml
+
+from gridreg.errors import InputError
+
+__all__ = ["Document", "KeyPath", "dump_yaml", "parse_yaml", "read_yaml"]
+
+KeyPath = tuple[str | int, ...]
+
+_RESOLVERS = [
+    ("bool", r"true|True|TRUE|false|False|FALSE", "tTfF"),
+    ("int", r"[-+]?[0-9]+(?:_[0-9]+)*|0o[0-7]+|0x[0-9a-fA-F]+", "-+0123456789"),
+    ("float", r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?", "-+.0123456789"),
+    ("float", r"[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)", "-+."),
+    ("null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
+]
+
+
+class Document(NamedTuple):
+    """Plain data and the line (from 1) at which each key or list item stands."""
+
+    data: Any
+    lines: dict[KeyPath, int]
+
+
+def read_yaml(path: str | os.PathLike[str]) -> Document:
+    """Read a YAML file; an empty one holds ``None``.
+
+    Raises:
+        InputError: if the file cannot be read, is not YAML, or uses what is refused here (anchors and
+        aliases,
+            tags, duplicate keys, keys that are not text); the text names file and line.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise InputError(f"{os.fspath(path)}: no such file; expected a YAML file") from None
+    except UnicodeDecodeError as error:
+        raise InputError(f"{os.fspath(path)}: not UTF-8 text at byte {error.start}") from error
+    except OSError as error:
+        raise InputError(f"{os.fspath(path)}: cannot read: {error.strerror}") from error
+    return parse_yaml(text, os.fspath(path))
+
+
+def parse_yaml(text: str, source: str = "YAML") -> Document:
+    """Parse YAML text; ``source`` names it in errors.
+
+    Raises:
+        InputError: as ``read_yaml``.
+
+    Example:
+        >>> parse_yaml("weight: 8e-5\\nname: off").data
+        {'weight': 8e-05, 'name': 'off'}
+    """
+    loader: _Loader | None = None
+    try:
+        # The constructor already looks at the characters, so it belongs inside.
+        loader = _Loader(text)
+        node = loader.get_single_node()
+        if node is None:
+            return Document(None, {})
+        lines: dict[KeyPath, int] = {}
+        _collect_lines(node, (), lines, source)
+        return Document(loader.construct_document(node), lines)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        where = f"{source}:{mark.line + 1}" if mark else source
+        problem = " ".join(part for part in (error.context, error.problem) if part)
+        raise InputError(f"{where}: not valid YAML: {_flat(problem)}") from error
+    except yaml.YAMLError as error:
+        raise InputError(f"{source}: not valid YAML: {_flat(str(error))}") from error
+    except InputError:
+        raise
+    except ValueError as error:
+        # Python refuses integers of more than some thousand digits.
+        raise InputError(f"{source}: not valid YAML: {_flat(str(error))}") from error
+    except RecursionError:
+        raise InputError(f"{source}: nested too deeply to be a configuration") from None
+    finally:
+        if loader is not None:
+            loader.dispose()
+
+
+def dump_yaml(data: Any) -> str:
+    """Plain data (dict, list, tuple, text, numbers, ``None``) as YAML that ``parse_yaml`` reads back equal.
+
+    Keys keep their order; tuples become lists; innermost lists and mappings stand on one line.
+
+    Raises:
+        yaml.representer.RepresenterError: if ``data`` holds anything that is not plain.
+    """
+    text: str = yaml.dump(
+        data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, default_flow_style=None, width=100
+    )
+    return text
+
+
+class _Loader(yaml.SafeLoader):
+    """SafeLoader with YAML 1.2 scalars and without aliases."""
+
+    yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012  (PyYAML's own mechanism)
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        event: Any = self.peek_event()  # type: ignore[no-untyped-call]
+        if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None) is not None:
+            self._refuse("anchors and aliases (& and *) are not supported; write the value out", event)
+        if getattr(event, "tag", None) not in (None, "!"):
+            self._refuse(f"the tag {event.tag} is not supported; write plain values", event)
+        return super().compose_node(parent, index)
+
+    def _refuse(self, problem: str, event: Any) -> NoReturn:
+        raise yaml.constructor.ConstructorError(None, None, problem, event.start_mark)
+
+
+class _Dumper(yaml.SafeDumper):
+    """SafeDumper that quotes what YAML 1.1 or 1.2 would read as something else, and writes no aliases."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+    def represent_text(self, data: str) -> yaml.ScalarNode:
+        # Only the double-quoted style keeps every line break (U+0085, U+2028) and control character.
+        style = None if data.isprintable() else '"'
+        return self.represent_scalar("tag:yaml.org,2002:str", data, style=style)
+
+
+_Dumper.add_representer(str, _Dumper.represent_text)
+
+
+def _construct_int(loader: _Loader, node: yaml.ScalarNode) -> int:
+    text = str(loader.construct_scalar(node)).replace("_", "")
+    return int(text, 0) if text[:2] in ("0o", "0x") else int(text, 10)
+
+
+def _construct_float(loader: _Loader, node: yaml.ScalarNode) -> float:
+    # ".inf" and ".nan" are Python's words but for the dot; "1." and ".5" are not affected.
+    return float(re.sub(r"\.(?=[a-zA-Z])", "", str(loader.construct_scalar(node))))
+
+
+for _tag, _pattern, _first in _RESOLVERS:
+    for _class in (_Loader, _Dumper):
+        _regexp = re.compile(f"^(?:{_pattern})$")
+        _class.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", _regexp, list(_first))
+_Loader.add_constructor("tag:yaml.org,2002:int", _construct_int)
+_Loader.add_constructor("tag:yaml.org,2002:float", _construct_float)
+
+
+def _collect_lines(node: yaml.Node, path: KeyPath, lines: dict[KeyPath, int], source: str) -> None:
+    """Fill ``lines`` and refuse keys that are not text or stand twice."""
+    lines.setdefault(path, node.start_mark.line + 1)
+    if isinstance(node, yaml.SequenceNode):
+        for index, item in enumerate(node.value):
+            _collect_lines(item, (*path, index), lines, source)
+    elif isinstance(node, yaml.MappingNode):
+        for key, value in node.value:
+            line = key.start_mark.line + 1
+            if key.tag != "tag:yaml.org,2002:str":
+                found = _flat(str(key.value)) if isinstance(key, yaml.ScalarNode) else "a list or mapping"
+                raise InputError(f"{source}:{line}: key {found}: expected text (quote it if it is meant so)")
+            inner = (*path, key.value)
+            if inner in lines:
+                raise InputError(f"{source}:{line}: {key.value}: stands twice, first in line {lines[inner]}")
+            lines[inner] = line
+            _collect_lines(value, inner, lines, source)
+
+
+def _flat(text: str) -> str:
+    return " ".join(text.split())
