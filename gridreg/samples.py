@@ -11,8 +11,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .errors import InputError
-from .segments import optical_depth_to_weights, spread, sum_before, sum_per_ray
+from gridreg.errors import InputError
+from gridreg.segments import optical_depth_to_weights, spread, sum_before, sum_per_ray
 
 __all__ = ["RaySamples"]
 

@@ -72,3 +72,57 @@ batches = st.builds(
     kept=st.sampled_from([0.0, 0.3, 0.8, 1.0]),
     scale=st.sampled_from([0.1, 3.0, 100.0]),
 )
+
+
+def occlusion(batch: Batch, mask: NDArray[np.bool_], on: str = "density") -> float:
+    """FreeNeRF equation 7: the mean over the whole rectangle of value times mask."""
+    values = batch.density if on == "density" else batch.weights
+    return float(np.mean(values * mask * batch.valid)) if values.size else 0.0
+
+
+def opacity_entropy(batch: Batch) -> float:
+    """DVGO's entropy of the last transmittance."""
+    clear = np.clip(1 - batch.weights.sum(1), 1e-6, 1 - 1e-6)
+    return mean(-(clear * np.log(clear) + (1 - clear) * np.log(1 - clear)))
+
+
+def ray_entropy(batch: Batch, threshold: float) -> float:
+    """InfoNeRF equations 5 to 8."""
+    result = []
+    for alpha, opacity in zip(batch.alpha, batch.weights.sum(1), strict=True):
+        share = alpha / (alpha.sum() + 1e-10)
+        result.append(-sum(p * np.log(p + 1e-10) for p in share) if opacity > threshold else 0.0)
+    return mean(result)
+
+
+def distortion(batch: Batch, near: float = 0.0, far: float = 1.0) -> float:
+    """mip-NeRF 360 equation 15, the double sum as printed."""
+    result = []
+    for t, delta, weights in batch.rays():
+        s, lengths = (t - near) / (far - near), delta / (far - near)
+        pairs = np.abs(s[:, None] - s[None, :]) * weights[:, None] * weights[None, :]
+        result.append(pairs.sum() + (weights**2 * lengths).sum() / 3)
+    return mean(result)
+
+
+def depth_smoothness(depth: Array) -> float:
+    """RegNeRF equation 5 on depth maps (count, height, width), averaged over its sum's terms."""
+    count, height, width = depth.shape
+    total = 0.0
+    for n in range(count):
+        for i in range(height - 1):
+            for j in range(width - 1):
+                total += (depth[n, i, j] - depth[n, i + 1, j]) ** 2
+                total += (depth[n, i, j] - depth[n, i, j + 1]) ** 2
+    return total / (count * (height - 1) * (width - 1))
+
+
+def ray_kl(alpha: Array) -> float:
+    """InfoNeRF equation 9 on opacities (count, height, width, steps): each ray and the one to its right."""
+    share = alpha / (alpha.sum(-1, keepdims=True) + 1e-10) + 1e-10
+    p, q = share[:, :, :-1], share[:, :, 1:]
+    return float(np.mean((p * np.log(p / q)).sum(-1)))
+
+
+def mean(values: Array | list[float]) -> float:
+    return float(np.mean(values)) if len(values) else 0.0
