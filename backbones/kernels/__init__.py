@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from backbones.kernels.autograd import accumulate_into_grad
 from backbones.kernels.dispatch import cp_density, cp_features, vm_density, vm_features
 
-__all__ = ["cp_density", "cp_features", "vm_density", "vm_features"]
+__all__ = ["accumulate_into_grad", "cp_density", "cp_features", "vm_density", "vm_features"]

@@ -32,6 +32,7 @@ from numba.extending import intrinsic
 __all__ = [
     "Kernel",
     "cube",
+    "exact",
     "float32",
     "inline",
     "int32",
@@ -41,6 +42,7 @@ __all__ = [
     "matrix",
     "next_task",
     "real",
+    "size",
     "uint8",
     "vector",
 ]
@@ -161,3 +163,9 @@ def integer(table, place):  # type: ignore[no-untyped-def]
 def real(table, place):  # type: ignore[no-untyped-def]
     """Argument ``place``, a number, as float32."""
     return np.float32(_as_double(table[2 + 4 * place]))
+
+
+@inline
+def size(table, place, axis):  # type: ignore[no-untyped-def]
+    """Length of argument ``place``, a tensor, along ``axis``; 1 for an axis that it does not have."""
+    return table[3 + 4 * place + axis]

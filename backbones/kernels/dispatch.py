@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from backbones.kernels import reference
+from backbones.kernels import autograd, reference
 from gridreg.errors import InputError
 from gridreg.rendering.backends import chosen_backend
 
@@ -37,6 +37,11 @@ def _takes_compiled(*tensors: Tensor) -> bool:
     return all(x.device.type == "cpu" and x.dtype == torch.float32 for x in tensors)
 
 
+def _count(lines: Sequence[Tensor], open_channels: int | None) -> int:
+    channels = lines[0].shape[-1]
+    return channels if open_channels is None else min(channels, open_channels)
+
+
 def vm_density(
     u: Tensor, planes: Sequence[Tensor], lines: Sequence[Tensor], open_channels: int | None = None
 ) -> Tensor:
@@ -60,6 +65,8 @@ def vm_density(
         ([6.0, 6.0], [1.5])
     """
     _check(u, planes, lines, open_channels)
+    if _takes_compiled(u, *planes, *lines):
+        return autograd.vm_density(u, planes, lines, _count(lines, open_channels))
     return reference.vm_density(u, planes, lines, open_channels)
 
 
@@ -68,6 +75,8 @@ def vm_features(
 ) -> Tensor:
     """Products of planes and lines, concatenated: ``(N, 3 C)``. Arguments as for `vm_density`."""
     _check(u, planes, lines, open_channels)
+    if _takes_compiled(u, *planes, *lines):
+        return autograd.vm_features(u, planes, lines, _count(lines, open_channels))
     return reference.vm_features(u, planes, lines, open_channels)
 
 

@@ -55,7 +55,9 @@ def _vm_products(
     u: Tensor, planes: Sequence[Tensor], lines: Sequence[Tensor], open_channels: int | None
 ) -> list[Tensor]:
     return [
-        _opened(_interpolated_plane(plane, u[:, a], u[:, b]) * _interpolated_line(line, u[:, v]), open_channels)
+        _opened(
+            _interpolated_plane(plane, u[:, a], u[:, b]) * _interpolated_line(line, u[:, v]), open_channels
+        )
         for plane, line, (a, b), v in zip(planes, lines, PLANE_AXES, LINE_AXES, strict=True)
     ]
 
