@@ -1,9 +1,29 @@
-"""Scenes: posed images from a folder, selected by a named protocol."""
+"""Scenes: posed images from a folder, selected by a named protocol, and a scene that needs no download."""
 
 from __future__ import annotations
 
+from gridreg.scenes.builtin import (
+    builtin_depth,
+    builtin_mesh,
+    builtin_scene,
+    builtin_signed_distance,
+    builtin_surface,
+)
 from gridreg.scenes.load import load_scene
 from gridreg.scenes.protocols import PROTOCOLS, Protocol, get_protocol
 from gridreg.scenes.views import Scene, Views, background_colour
 
-__all__ = ["PROTOCOLS", "Protocol", "Scene", "Views", "background_colour", "get_protocol", "load_scene"]
+__all__ = [
+    "PROTOCOLS",
+    "Protocol",
+    "Scene",
+    "Views",
+    "background_colour",
+    "builtin_depth",
+    "builtin_mesh",
+    "builtin_scene",
+    "builtin_signed_distance",
+    "builtin_surface",
+    "get_protocol",
+    "load_scene",
+]

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 import io
 import struct
 import zlib
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +14,7 @@ from PIL import Image
 from gridreg.errors import InputError
 from gridreg.scenes.png16 import decode_png16, is_png16
 
-__all__ = ["ReadImage", "area_mean", "read_rgba"]
+__all__ = ["area_mean", "read_rgba"]
 
 _DECODER_ERRORS = (
     OSError,
@@ -29,14 +27,7 @@ _DECODER_ERRORS = (
 )
 
 
-class ReadImage(NamedTuple):
-    """An image and the hash of the bytes it was decoded from."""
-
-    rgba: NDArray[np.float32]
-    sha256: str
-
-
-def read_rgba(path: Path, *, opaque: bool = False) -> ReadImage:
+def read_rgba(path: Path, *, opaque: bool = False) -> NDArray[np.float32]:
     """Read a PNG or JPEG (or anything else Pillow knows) as float RGBA.
 
     Args:
@@ -44,7 +35,7 @@ def read_rgba(path: Path, *, opaque: bool = False) -> ReadImage:
         opaque: give images without alpha an alpha of 1 instead of refusing them.
 
     Returns:
-        ``(H, W, 4)`` float32 in [0, 1] with straight alpha, and the SHA-256 of the file.
+        ``(H, W, 4)`` float32 in [0, 1] with straight alpha.
 
     Raises:
         InputError: when the file is missing, cannot be decoded or has no alpha channel.
@@ -64,17 +55,18 @@ def read_rgba(path: Path, *, opaque: bool = False) -> ReadImage:
         if not opaque:
             raise InputError(f"{path}: image has no alpha channel, expected RGBA")
         rgba = np.concatenate([rgba, np.ones_like(rgba[..., :1])], axis=-1)
-    return ReadImage(rgba, hashlib.sha256(data).hexdigest())
+    return rgba
 
 
 def _decode(data: bytes) -> NDArray[np.float32]:
     """Decode to ``(H, W, 3)`` or ``(H, W, 4)``, whichever the file holds."""
     with Image.open(io.BytesIO(data)) as image:
         if image.mode.startswith("I;16"):
-            grey = np.divide(np.asarray(image), 65535, dtype=np.float32)
+            grey: NDArray[np.float32] = np.divide(np.asarray(image), 65535, dtype=np.float32)
             return np.repeat(grey[..., None], 3, axis=-1)
         mode = "RGBA" if image.has_transparency_data else "RGB"
-        return np.divide(np.asarray(image.convert(mode)), 255, dtype=np.float32)
+        pixels: NDArray[np.float32] = np.divide(np.asarray(image.convert(mode)), 255, dtype=np.float32)
+        return pixels
 
 
 def area_mean(image: NDArray[np.float32], factor: int) -> NDArray[np.float32]:

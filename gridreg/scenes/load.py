@@ -154,12 +154,13 @@ class _ViewReader:
         for i in ids:
             frame = frames[i]
             path = resolve_inside(self.folder, frame.file_path, frame.where)
-            image, sha256 = read_rgba(path, opaque=self.opaque)
+            image = read_rgba(path, opaque=self.opaque)
             height, width = image.shape[:2]
             self._check_size(path, frame, width, height)
             factor = self._factor(width, path)
             values = np.array(frame.camera.intrinsics(width, height)) / factor
-            digest.update(f"{i} {sha256} {factor}".encode() + frame.pose.tobytes() + values.tobytes())
+            digest.update(f"{i} {factor} {image.shape}".encode() + frame.pose.tobytes() + values.tobytes())
+            digest.update(image.tobytes())
             images.append(area_mean(image, factor))
             self.reduced = images[-1].shape[:2]
             intrinsics.append(values)

@@ -45,7 +45,8 @@ def decode_png16(data: bytes) -> NDArray[np.float32]:
         raise ValueError(f"unknown row filter {rows[:, 0].max()}")
     pixels = _unfilter(rows[:, 0], rows[:, 1:].reshape(height, width, channels * 2))
     values = np.ascontiguousarray(pixels).view(">u2").reshape(height, width, channels)
-    return np.divide(values, 65535, dtype=np.float32)
+    scaled: NDArray[np.float32] = np.divide(values, 65535, dtype=np.float32)
+    return scaled
 
 
 def _image_data(data: bytes) -> bytes:

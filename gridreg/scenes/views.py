@@ -116,7 +116,7 @@ class Scene:
         far: distance along a ray, world units, beyond which nothing is looked for.
         bounds: ``(2, 3)`` float32, lower and upper corner of the box that holds the scene, world units.
         background: ``(3,)`` float32, the colour behind renders and targets.
-        fingerprint: hash of what training sees: the training images' bytes, ids, size and cameras. It does
+        fingerprint: hash of what training sees: the training images' pixels, ids, size and cameras. It does
             not depend on which test or validation views were read, so a checkpoint can be scored on others.
         builtin: whether this is the built-in scene, which no published figure is about.
         validation: views outside both, for tuning, when they were asked for.
