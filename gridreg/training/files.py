@@ -121,7 +121,8 @@ def write_json(path: str | os.PathLike[str], value: Any, *, sort_keys: bool = Tr
         TypeError: if ``value`` holds something that JSON does not know.
     """
     text = json.dumps(value, indent=2, sort_keys=sort_keys, allow_nan=False, ensure_ascii=False)
-    write_text(path, text + "\n")
+    # Of a file name that is not UTF-8 Python keeps lone surrogates; escaped, they are JSON again.
+    write_bytes(path, (text + "\n").encode("utf-8", "backslashreplace"))
 
 
 def check_output_folder(path: str | os.PathLike[str]) -> Path:
