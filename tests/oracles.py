@@ -126,3 +126,19 @@ def ray_kl(alpha: Array) -> float:
 
 def mean(values: Array | list[float]) -> float:
     return float(np.mean(values)) if len(values) else 0.0
+
+
+def total_variation(values: Array, axes: set[int]) -> float:
+    """Sum over axes of the mean squared difference of neighbours."""
+    total = 0.0
+    for axis in axes:
+        lines = np.moveaxis(values, axis, -1).reshape(-1, values.shape[axis])
+        squares = [(line[i + 1] - line[i]) ** 2 for line in lines for i in range(len(line) - 1)]
+        total += mean(squares)
+    return total
+
+
+def orthogonality(lines: Array) -> float:
+    """TensoRF's vectorDiffs: the mean absolute dot product of different rows."""
+    dots = [abs(float(a @ b)) for i, a in enumerate(lines) for j, b in enumerate(lines) if i != j]
+    return mean(dots)

@@ -1,0 +1,227 @@
+"""Penalties on the raw grids of a site: total variation, mean absolute value, orthogonality of lines."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gridreg.base import Context, LocalTerm, Regularizer, check_site, check_weight, register
+from gridreg.errors import InputError
+from gridreg.schedules import Linear, Numeric
+from gridreg.sites import Grid, SiteLike
+
+__all__ = ["L1", "Orthogonality", "TotalVariation", "l1", "orthogonality", "total_variation"]
+
+
+def total_variation(values: Tensor, axes: Sequence[int]) -> Tensor:
+    """Sum over axes of the mean squared difference of neighbours along the axis.
+
+    ``sum_a mean((v[i + 1] - v[i])^2 along a)``; an axis of length 1 has no neighbours and adds nothing.
+
+    Args:
+        values: a grid, any shape.
+        axes: its spatial axes.
+
+    Returns:
+        Scalar, squared unit of the values. Source: TensoRF (Chen et al. 2022), section 4.3; its program's
+        `TVLoss` is twice this, for each plane.
+
+    Example:
+        >>> total_variation(torch.tensor([[0.0, 1.0], [0.0, 1.0]]), axes=(0, 1)).item()
+        1.0
+    """
+    total = values.new_zeros(())
+    for axis in axes:
+        if values.shape[axis] > 1:
+            total = total + values.diff(dim=axis).square().mean()
+    return total
+
+
+def l1(values: Tensor) -> Tensor:
+    """Mean absolute value of a grid.
+
+    Args:
+        values: any shape.
+
+    Returns:
+        Scalar. Source: TensoRF (Chen et al. 2022), equation 17.
+
+    Example:
+        >>> l1(torch.tensor([-1.0, 3.0])).item()
+        2.0
+    """
+    return values.abs().mean()
+
+
+def orthogonality(lines: Tensor) -> Tensor:
+    """Mean absolute value of what lies off the diagonal of ``V V^T``: channels should not repeat each other.
+
+    Args:
+        lines: ``(R, M)``, one row for each of `R` channels.
+
+    Returns:
+        Scalar; 0 for a single channel. Source: TensoRF's program, `vectorDiffs`.
+
+    Example:
+        >>> orthogonality(torch.eye(3)).item(), orthogonality(torch.ones(2, 5)).item()
+        (0.0, 5.0)
+    """
+    count = lines.shape[0]
+    if count < 2:
+        return lines.sum() * 0
+    products = (lines @ lines.T).abs()
+    return (products.sum() - products.diagonal().sum()) / (count * (count - 1))
+
+
+def _spatial(grid: Grid, who: str) -> tuple[int, ...]:
+    """Axes along which a grid has neighbours."""
+    axes = tuple(axis for axis in grid.spatial if grid.parameter.shape[axis] > 1)
+    if not axes:
+        raise InputError(
+            f"{who}: {grid.name} of shape {tuple(grid.parameter.shape)} has no spatial axis longer than 1; "
+            "name its axes with spatial=..."
+        )
+    return axes
+
+
+@register
+@dataclass(frozen=True)
+class TotalVariation(Regularizer):
+    """Differences between neighbouring cells of the site's grids are penalised: see `total_variation`.
+
+    Added over the grids of the site. TensoRF's `TV_weight_density` and `TV_weight_app` act on planes only,
+    with factors 2 and 0.01 on top: its weight `w` is ``weight=0.02 * w`` on "density.planes" or
+    "appearance.planes" here.
+
+    Args:
+        site: its `grids` are penalised.
+        weight: factor of the loss; TensoRF: 0.1 to 1.0 (times 0.02), on CP lines 1e-3 (times 2).
+
+    Formula: ``sum over grids and spatial axes of mean((g[i + 1] - g[i])^2)``
+    Unit: squared unit of the grid
+    Source: TensoRF (Chen et al. 2022), section 4.3
+
+    Raises:
+        InputError: the site or the weight is not one; a grid has no spatial axes.
+
+    Example:
+        >>> TotalVariation("density", weight=0.01).weight
+        0.01
+    """
+
+    site: SiteLike
+    weight: Numeric = 0.01
+
+    def __post_init__(self) -> None:
+        """Refuse at once what can be refused before the first step."""
+        check_site(self.site)
+        check_weight(self.weight)
+
+    def grid_penalty(self, grids: Sequence[Grid], context: Context) -> Tensor:
+        """`total_variation`, added over the grids."""
+        return torch.stack([total_variation(g.values, _spatial(g, "TotalVariation")) for g in grids]).sum()
+
+    def local_terms(self, grids: Sequence[Grid], context: Context) -> list[LocalTerm]:
+        """One for each grid, if all channels take part."""
+        if any(grid.selected is not None for grid in grids):
+            return []
+        return [LocalTerm("total_variation", 1.0, g.parameter, _spatial(g, "TotalVariation")) for g in grids]
+
+    @classmethod
+    def examples(cls, site: SiteLike) -> list[Regularizer]:
+        """With a number and with a schedule."""
+        return [cls(site), cls(site, weight=Linear(0.0, 1.0))]
+
+
+@register
+@dataclass(frozen=True)
+class L1(Regularizer):
+    """Values of the site's grids are drawn to 0: see `l1`.
+
+    Args:
+        site: its `grids` are penalised; TensoRF: the density's.
+        weight: factor of the loss; TensoRF: 8e-5, from the first occupancy mask on 4e-5; on CP lines 1e-5.
+
+    Formula: ``sum over grids of mean(abs(g))``
+    Unit: unit of the grid
+    Source: TensoRF (Chen et al. 2022), equation 17
+
+    Raises:
+        InputError: the site or the weight is not one.
+
+    Example:
+        >>> from gridreg.schedules import Piecewise
+        >>> L1("density", weight=Piecewise(values=(8e-5, 4e-5), steps=(2000,))).weight.at(2000, 15_000)
+        4e-05
+    """
+
+    site: SiteLike
+    weight: Numeric = 8e-5
+
+    def __post_init__(self) -> None:
+        """Refuse at once what can be refused before the first step."""
+        check_site(self.site)
+        check_weight(self.weight)
+
+    def grid_penalty(self, grids: Sequence[Grid], context: Context) -> Tensor:
+        """`l1`, added over the grids."""
+        return torch.stack([l1(grid.values) for grid in grids]).sum()
+
+    def local_terms(self, grids: Sequence[Grid], context: Context) -> list[LocalTerm]:
+        """One for each grid, if all channels take part."""
+        if any(grid.selected is not None for grid in grids):
+            return []
+        return [LocalTerm("l1", 1.0, grid.parameter, grid.spatial) for grid in grids]
+
+    @classmethod
+    def examples(cls, site: SiteLike) -> list[Regularizer]:
+        """At its default."""
+        return [cls(site)]
+
+
+@register
+@dataclass(frozen=True)
+class Orthogonality(Regularizer):
+    """Channels of the site's lines should not repeat each other: see `orthogonality`.
+
+    Lines are the grids with one spatial axis; planes and voxels at the same site are left alone.
+
+    Args:
+        site: the lines among its `grids` are penalised.
+        weight: factor of the loss; Few TensoRF: 0.01.
+
+    Formula: ``sum over lines V (channels x nodes) of mean(abs(V V^T)) off the diagonal``
+    Unit: squared unit of the grid, times nodes
+    Source: TensoRF's program (`Ortho_weight`)
+
+    Raises:
+        InputError: the site or the weight is not one; the site has no lines.
+
+    Example:
+        >>> Orthogonality("density").weight
+        0.01
+    """
+
+    site: SiteLike
+    weight: Numeric = 0.01
+
+    def __post_init__(self) -> None:
+        """Refuse at once what can be refused before the first step."""
+        check_site(self.site)
+        check_weight(self.weight)
+
+    def grid_penalty(self, grids: Sequence[Grid], context: Context) -> Tensor:
+        """`orthogonality`, added over the lines."""
+        lines = [grid for grid in grids if len(_spatial(grid, "Orthogonality")) == 1]
+        if not lines:
+            names = ", ".join(grid.name for grid in grids)
+            raise InputError(f"Orthogonality: expected grids with one spatial axis, found none among {names}")
+        return torch.stack([orthogonality(g.values.movedim(g.dim, 0).flatten(1)) for g in lines]).sum()
+
+    @classmethod
+    def examples(cls, site: SiteLike) -> list[Regularizer]:
+        """At its default."""
+        return [cls(site)]
