@@ -46,13 +46,15 @@ class Context:
     Attributes:
         clock: step, total_steps and generator of the handle.
         place: the tensor that a transform acts on; None in penalties and hooks.
-        state: tensors that belong to the regularizer at this place; the handle saves, loads and keeps them, also when
-            a parameter is replaced. Write into them in place, so that compiled code sees the change.
+        state: tensors that belong to the regularizer at this place; the handle saves, loads and keeps
+            them, also when a parameter is replaced. Write into them in place: compiled code then sees it.
+        prepared_at: the step at which `prepare` was called last; set by the handle.
     """
 
     clock: Clock
     place: Place | None = None
     state: dict[str, Tensor] = field(default_factory=dict)
+    prepared_at: int | None = None
 
     @property
     def step(self) -> int:
@@ -114,45 +116,49 @@ class LocalTerm:
 class Regularizer:
     """Base of all regularizers: a frozen dataclass whose fields are its configuration.
 
-    A regularizer plays one or more parts. Each part is a method below that does nothing by default; the handle finds out
-    which parts a class plays by looking at what it overrides. Whatever changes during a run lives in the context's state.
+    A regularizer plays one or more parts. Each part is a method below that does nothing by default; the
+    handle finds out which parts a class plays by looking at what it overrides. Whatever changes during a run
+    lives in the context's state.
 
     Class attributes:
-        acts_on: the part of a declared site that `transform` acts on: "mask" (channel masks) or "grids" (low-passes).
+        acts_on: the part of a declared site that `transform` acts on: "mask" (channel masks) or "grids"
+            (low-passes).
         train_only: skip `transform` while the module that owns the tensor is in eval mode.
-        gradient_only: the forward values stay as they are, only gradients change.
         weight: factor of the penalty, in subclasses that have one.
     """
 
     acts_on: ClassVar[Literal["mask", "grids"]] = "mask"
     train_only: ClassVar[bool] = False
-    gradient_only: ClassVar[bool] = False
 
-    # --- where ---------------------------------------------------------------------------------------------------
+    # --- where -------------------------------------------------------------------------------------
 
     def sites(self) -> tuple[SiteLike, ...]:
         """Sites that it attaches to or reads; by default the field `site`, or none."""
         site = getattr(self, "site", None)
         return () if site is None else (site,)
 
-    # --- features and parameters ---------------------------------------------------------------------------------
+    # --- features and parameters -------------------------------------------------------------------
 
     def prepare(self, context: Context) -> None:
-        """Called at each `handle.step` (and when attaching): compute what `transform` needs into `context.state`."""
+        """Called at each `handle.step` and when attaching: compute what `transform` needs into the state."""
 
     def transform(self, value: Tensor, context: Context) -> Tensor:
-        """The tensor that the field gets to see at `context.place` instead of `value`. Called at each access."""
+        """What the field gets to see at `context.place` instead of `value`. Called at each access."""
         return value
 
     def is_identity(self, context: Context) -> bool:
-        """True: `transform` is skipped until the next step, and outputs stay bit-identical. Asked after `prepare`."""
+        """True: `transform` is skipped until the next step. Asked after `prepare`."""
         return False
 
     def open_channels(self, context: Context) -> int | None:
-        """Channels of the tensor at and beyond this index are exactly zero after `transform`; None: no such tail."""
+        """Channels at and beyond this index are exactly 0 after `transform`; None: no such tail."""
         return None
 
-    # --- losses --------------------------------------------------------------------------------------------------
+    def gradient_only(self) -> bool:
+        """True: `transform` leaves the values as they are and changes only gradients."""
+        return False
+
+    # --- losses ------------------------------------------------------------------------------------
 
     def needs(self) -> tuple[str, ...]:
         """Attributes of the samples that `penalty` reads and that a renderer may leave out (None)."""
@@ -170,14 +176,14 @@ class Regularizer:
         """The grid penalty as closed forms per parameter, without the weight, or [] if it has none."""
         return []
 
-    # --- samples, data, sampling, optimizer ----------------------------------------------------------------------
+    # --- samples, data, sampling, optimizer --------------------------------------------------------
 
     def on_samples(self, samples: RaySamples, context: Context) -> RaySamples:
         """The samples that the loss and the compositing get to see."""
         return samples
 
     def background(
-        self, count: int, default: Tensor | None, generator: torch.Generator, context: Context
+        self, count: int, generator: torch.Generator, default: Tensor | None, context: Context
     ) -> Tensor | None:
         """Background colours `(count, 3)` of a batch of training rays, or the default `(3,)`, or None."""
         return default
@@ -193,17 +199,17 @@ class Regularizer:
         return groups
 
     def update_groups(self, groups: list[dict[str, Any]], grids: Sequence[Grid], context: Context) -> None:
-        """Bring schedule-driven entries of the optimizer's groups up to date, in place. Asked at each step."""
+        """Bring schedule-driven entries of the optimizer's groups up to date, in place, at each step."""
 
-    # --- telling -------------------------------------------------------------------------------------------------
+    # --- telling -----------------------------------------------------------------------------------
 
     def value(self, context: Context) -> float:
-        """One number for tables and curves: by default the weight now."""
-        return context.at(getattr(self, "weight", float("nan"))) if hasattr(self, "weight") else 1.0
+        """One number for tables and curves: by default the weight now, 1 for those without a weight."""
+        return context.at(getattr(self, "weight", 1.0), "weight")
 
     @classmethod
     def examples(cls, site: SiteLike) -> list[Regularizer]:
-        """Instances for the contract suite, at `site` where the class takes one. Every registered class has some."""
+        """Instances for the contract suite, at `site` where the class takes one."""
         return []
 
 
@@ -214,7 +220,7 @@ REGISTRY: dict[str, type[Regularizer]] = {}
 
 
 def register(cls: RegularizerClass) -> RegularizerClass:
-    """Class decorator: make a regularizer known to `from_config` and to the contract suite under its class name.
+    """Class decorator: make a regularizer known to `from_config` and to the contract suite by its class name.
 
     Raises:
         InputError: not a frozen dataclass, or it does not override `examples`.
@@ -249,5 +255,6 @@ def check_site(value: object) -> None:
     """
     if not isinstance(value, (str, Selector, Site)):
         raise InputError(
-            f"site={value!r}: expected the name of a declared site, gridreg.parameters(...), outputs(...) or inputs(...)"
+            f"site={value!r}: expected the name of a declared site, or "
+            "gridreg.parameters(...), gridreg.outputs(...) or gridreg.inputs(...)"
         )

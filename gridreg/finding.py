@@ -11,9 +11,9 @@ from typing import Literal, TypeAlias
 from torch import Tensor, nn
 
 from gridreg.errors import InputError
-from gridreg.sites import Match, Place, Selector, Site, SiteLike, abridged
+from gridreg.sites import Match, Place, Selector, Site, SiteLike
 
-__all__ = ["check_octaves", "find", "register_adapter", "sites_of"]
+__all__ = ["find", "register_adapter", "sites_of"]
 
 Adapter: TypeAlias = Callable[[nn.Module], Mapping[str, "Site | Selector"]]
 
@@ -46,8 +46,8 @@ def _declared_by(module: nn.Module) -> dict[str, Site]:
 def sites_of(field: nn.Module) -> dict[str, Site]:
     """Sites that a field declares, by name.
 
-    A wrapper (DistributedDataParallel, a compiled module) that declares none shows those of the one module inside that
-    does.
+    A wrapper (DistributedDataParallel, a compiled module) that declares none shows those of the one module
+    inside that does.
     """
     own = _declared_by(field)
     if own:
@@ -147,18 +147,9 @@ def _find_parameters(field: nn.Module, selector: Selector) -> list[Match]:
     matches = []
     for name, tensor in tensors.items():
         path, _, attribute = name.rpartition(".")
-        size = tensor.shape[dims[name]]
-        selected = _selected(selector, size, name)
-        place = Place(
-            name,
-            "parameters",
-            dims[name],
-            size,
-            selected,
-            selector.octaves,
-            _spatial_axes(tensor, dims[name], selector.spatial),
-        )
-        check_octaves(place)
+        spatial = _spatial_axes(tensor, dims[name], selector.spatial)
+        place = Place(name, selector, dims[name], spatial, selector.octaves)
+        place.complete(tensor.shape[dims[name]])
         matches.append(Match(place, field.get_submodule(path), attribute))
     return matches
 
@@ -172,14 +163,14 @@ def _find_modules(field: nn.Module, selector: Selector) -> list[Match]:
     matches = []
     for name in names:
         module = modules[name]
-        size = None
-        if isinstance(module, nn.Linear) and selector.dim in (-1, 1):
-            size = module.in_features if selector.kind == "inputs" else module.out_features
-        place = Place(name, selector.kind, selector.dim, size, None, selector.octaves)
-        if size is not None:
-            place.selected = _selected(selector, size, name)
-            check_octaves(place)
-        matches.append(Match(place, module, selector.kind, selector.item))
+        octaves = selector.octaves
+        if octaves is None and selector.kind == "outputs" and selector.channels is None:
+            # Encodings that know their octaves, such as gridreg.PositionalEncoding.
+            octaves = getattr(module, "channel_octaves", None)
+        place = Place(name, selector, selector.dim, octaves=octaves)
+        if isinstance(module, nn.Linear) and selector.dim == -1:
+            place.complete(module.in_features if selector.kind == "inputs" else module.out_features)
+        matches.append(Match(place, module, selector.kind))
     return matches
 
 
@@ -198,14 +189,14 @@ def _checked_dim(name: str, tensor: Tensor, selector: Selector) -> int:
             )
     elif count in (4, 5) and tensor.shape[0] == 1 and dim >= 2:
         raise InputError(
-            f"dim={selector.dim} of {selector}: in {name} of shape {tuple(tensor.shape)} this axis is spatial; "
+            f"dim={selector.dim} of {selector}: is a spatial axis of {name}, shape {tuple(tensor.shape)}; "
             "the channel axis is 1 (if it is not, say which axes are spatial with spatial=...)"
         )
     return dim
 
 
 def _check_sizes(tensors: Mapping[str, Tensor], dims: Mapping[str, int], selector: Selector) -> None:
-    """Refuse matches of unequal length along `dim`: a sign that the axis is spatial, unless said otherwise."""
+    """Refuse matches of unequal length along `dim`, a sign that the axis is spatial."""
     sizes = {name: tensor.shape[dims[name]] for name, tensor in tensors.items()}
     if len(set(sizes.values())) > 1 and selector.spatial is None:
         listed = ", ".join(f"{name} {size}" for name, size in list(sizes.items())[:6])
@@ -222,28 +213,3 @@ def _spatial_axes(tensor: Tensor, dim: int, spatial: tuple[int, ...] | None) -> 
     leading = dim in (0, 1) and dim != tensor.ndim - 1
     axes = range(dim + 1, tensor.ndim) if leading else range(dim)
     return tuple(axis for axis in axes if tensor.shape[axis] > 1)
-
-
-def _selected(selector: Selector, size: int, name: str) -> tuple[int, ...] | None:
-    """Indices of the channels that take part."""
-    channels = selector.channels
-    if channels is None:
-        return None
-    if isinstance(channels, str):
-        parts = [int(part) if part else None for part in channels.split(":")]
-        channels = tuple(range(size))[slice(*parts)]
-    if not channels or max(channels) >= size:
-        raise InputError(f"channels={abridged(selector.channels)} of {selector}: {name} has {size} channels")
-    return channels
-
-
-def check_octaves(place: Place) -> None:
-    """Refuse octaves that do not number one per channel.
-
-    Raises:
-        InputError: naming both lengths.
-    """
-    if place.octaves is not None and place.channels is not None and len(place.octaves) != place.channels:
-        raise InputError(
-            f"octaves of {place.name}: {len(place.octaves)} octaves for {place.channels} channels; expected one each"
-        )

@@ -1,7 +1,7 @@
 """Schedules: a number, or a function of the step.
 
-Every numeric argument of a regularizer is a `Numeric`: a plain number, a `Schedule`, or any callable of the step.
-Schedules are frozen dataclasses, so they compare by value and go to plain data and back.
+Every numeric argument of a regularizer is a `Numeric`: a plain number, a `Schedule`, or any callable of the
+step. Schedules are frozen dataclasses, so they compare by value and go to plain data and back.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ def resolve(value: Numeric, step: int, total_steps: int, name: str = "value") ->
 
 
 def check_numeric(name: str, value: object, low: float = -math.inf, high: float = math.inf) -> None:
-    """Refuse at construction what can be refused then: plain numbers outside [low, high], NaN, and non-numbers.
+    """Refuse at construction what can be refused then: numbers outside [low, high], NaN, and non-numbers.
 
     Schedules and callables are checked when they are read (`gridreg.base.Context.at`).
 

@@ -53,7 +53,8 @@ class Selector:
 
 @dataclass(frozen=True)
 class Site:
-    """A site that a field declares: where a channel mask acts, and the raw grids that penalties and low-passes act on.
+    """A site that a field declares: where a channel mask acts, and the raw grids for penalties and
+    low-passes.
 
     Args:
         mask: selectors whose channels a mask multiplies. Masking one factor of a product (the lines of a
@@ -85,26 +86,57 @@ class Place:
 
     Attributes:
         name: dotted name on the field, unique within its kind.
-        kind: "parameters", "outputs" or "inputs".
+        selector: what matched it.
         dim: channel axis; not negative for parameters, as given for outputs and inputs.
+        spatial: spatial axes; empty for outputs and inputs.
+        octaves: octave of each channel that takes part, None where the site knows none.
         size: length of the channel axis; None for outputs and inputs whose length shows at the first call.
         selected: indices of the channels that take part, None for all.
-        octaves: octave of each channel that takes part, None where the site knows none.
-        spatial: spatial axes; empty for outputs and inputs.
     """
 
     name: str
-    kind: Kind
+    selector: Selector
     dim: int
-    size: int | None
-    selected: tuple[int, ...] | None = None
-    octaves: tuple[int, ...] | None = None
     spatial: tuple[int, ...] = ()
+    octaves: tuple[int, ...] | None = None
+    size: int | None = None
+    selected: tuple[int, ...] | None = None
+
+    @property
+    def kind(self) -> Kind:
+        """Whether it is a parameter, an output or an input."""
+        return self.selector.kind
 
     @property
     def channels(self) -> int | None:
         """How many channels take part: the length of a mask at this place."""
         return self.size if self.selected is None else len(self.selected)
+
+    def complete(self, size: int) -> None:
+        """Fill in the length of the channel axis, once it is known.
+
+        Raises:
+            InputError: the selected channels do not exist, or the octaves do not number one per channel.
+        """
+        selected, spec = None, self.selector.channels
+        if isinstance(spec, str):
+            start, stop, *step = (int(part) if part else None for part in spec.split(":"))
+            selected = tuple(range(size))[slice(start, stop, *step)]
+            if not selected or (stop or 0) > size:
+                raise InputError(f"channels={spec!r} of {self.selector}: {self.name} has {size} channels")
+        elif spec is not None:
+            selected = spec
+            if max(spec) >= size:
+                raise InputError(
+                    f"channels={abridged(spec)} of {self.selector}: {self.name} has {size} channels"
+                )
+        count = size if selected is None else len(selected)
+        if self.octaves is not None and len(self.octaves) != count:
+            raise InputError(
+                f"octaves of {self.selector}: found {len(self.octaves)}, "
+                f"expected one for each of the {count} channels of {self.name}"
+            )
+        self.size, self.selected = size, selected
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +174,6 @@ class Match:
     place: Place
     module: nn.Module
     attribute: str
-    item: int | str | None = None
 
     def grid(self) -> Grid:
         """The raw tensor behind this place."""
@@ -157,7 +188,7 @@ class Match:
 
 def raw_tensor(module: nn.Module, attribute: str) -> Tensor:
     """What `_parameters` or `_buffers` hold, past any property that is attached."""
-    tensor = module._parameters.get(attribute)
+    tensor: Tensor | None = module._parameters.get(attribute)
     if tensor is None:
         tensor = module._buffers.get(attribute)
     if tensor is None:
@@ -182,8 +213,8 @@ def parameters(
         dim: the channel axis.
         channels: channels that take part, as a slice or indices; all by default.
         octaves: octave of each channel that takes part (-1: the identity), where channels are an encoding.
-        spatial: spatial axes; by default those after a leading `dim`, those before a trailing one, without axes of
-            length 1.
+        spatial: spatial axes; by default those after a leading `dim`, those before a trailing one, without
+            axes of length 1.
 
     >>> print(parameters("density_line.*", dim=1))
     parameters('density_line.*', dim=1)
@@ -201,8 +232,8 @@ def outputs(
 ) -> Selector:
     """Site: what submodules return whose dotted names match `glob` (`""` is the field itself).
 
-    Only calls count (`encoder(x)`), not `encoder.forward(x)`. Arguments as in `parameters`; `item` is the index or key
-    where a module returns a tuple or a dict.
+    Only calls count (`encoder(x)`), not `encoder.forward(x)`. Arguments as in `parameters`; `item` is the
+    index or key where a module returns a tuple or a dict.
     """
     return _selector("outputs", glob, dim, channels, octaves, None, item)
 
@@ -217,7 +248,7 @@ def inputs(
 ) -> Selector:
     """Site: what submodules are called with, for encodings that are computed in a plain function.
 
-    Arguments as in `outputs`; `item` is the position or the keyword of the argument (default: the first tensor).
+    Arguments as in `outputs`; `item` is the position or keyword of the argument, by default the first tensor.
 
     >>> print(inputs("mlp.0", channels=slice(30, 150)))
     inputs('mlp.0', dim=-1, channels='30:150')
