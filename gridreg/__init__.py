@@ -1,6 +1,6 @@
 """Regularizers for grid radiance fields, attached from the outside."""
 
-from gridreg.apply import Handle, apply
+from gridreg.apply import apply
 from gridreg.attach import open_channels, strip
 from gridreg.base import REGISTRY, Clock, Context, LocalTerm, Regularizer, overrides, register
 from gridreg.channel_masks import Mask
@@ -9,7 +9,9 @@ from gridreg.dropout import ComponentDropout, component_dropout
 from gridreg.encodings import PositionalEncoding, octaves_of_channels, positional_encoding
 from gridreg.errors import InputError
 from gridreg.finding import register_adapter, sites_of
-from gridreg.mask_regularizers import CosineMask, FixedMask, FrequencyMask, LevelMask, ViewDependenceMask
+from gridreg.handle import Handle
+from gridreg.level_masks import LevelMask, ViewDependenceMask
+from gridreg.mask_regularizers import CosineMask, FixedMask, FrequencyMask
 from gridreg.masks import (
     authors_frequency_mask,
     cosine_mask,

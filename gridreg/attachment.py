@@ -216,7 +216,7 @@ def _label(site: SiteLike) -> str:
         return site
     if isinstance(site, Selector):
         return site.pattern
-    return ", ".join(selector.pattern for selector in site.mask or site.grids or ())
+    return ", ".join(selector.pattern for selector in site.selectors("mask") or site.selectors("grids"))
 
 
 def _rows(regularizers: Sequence[Regularizer], clock: Clock) -> list[Row]:

@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import MISSING, fields
 from typing import Any
 
-from gridreg.apply import Handle
 from gridreg.base import REGISTRY, Regularizer
 from gridreg.errors import InputError
+from gridreg.handle import Handle
 from gridreg.schedules import SCHEDULES, Schedule
 from gridreg.sites import Selector, Site, inputs, outputs, parameters
 
@@ -81,8 +81,8 @@ def _to_plain(value: Any, where: str) -> Any:
         }
     if isinstance(value, Site):
         return {
-            "mask": [_to_plain(selector, where) for selector in value.mask],
-            "grids": [_to_plain(selector, where) for selector in value.grids or ()],
+            "mask": [_to_plain(selector, where) for selector in value.selectors("mask")],
+            "grids": [_to_plain(selector, where) for selector in value.selectors("grids")],
         }
     if isinstance(value, Schedule):
         name = type(value).__name__

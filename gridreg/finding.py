@@ -68,7 +68,7 @@ def _prefixed(site: Site, prefix: str) -> Site:
     def moved(selectors: Iterable[Selector]) -> tuple[Selector, ...]:
         return tuple(replace(s, pattern=f"{prefix}.{s.pattern}".rstrip(".")) for s in selectors)
 
-    return Site(moved(site.mask), moved(site.grids or ()))
+    return Site(moved(site.selectors("mask")), moved(site.selectors("grids")))
 
 
 def find(field: nn.Module, site: SiteLike, part: Literal["mask", "grids"]) -> list[Match]:
@@ -91,8 +91,7 @@ def find(field: nn.Module, site: SiteLike, part: Literal["mask", "grids"]) -> li
         site = declared[site]
     if isinstance(site, Selector):
         site = Site((site,))
-    selectors = site.mask if part == "mask" else site.grids or ()
-    return [match for selector in selectors for match in _find_selector(field, selector)]
+    return [match for selector in site.selectors(part) for match in _find_selector(field, selector)]
 
 
 def _unknown(name: str, names: Sequence[str], reason: str) -> str:

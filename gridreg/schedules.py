@@ -22,7 +22,9 @@ __all__ = [
     "Piecewise",
     "Schedule",
     "check_numeric",
+    "check_until",
     "end_step",
+    "fixed_end",
     "register_schedule",
     "resolve",
 ]
@@ -123,6 +125,27 @@ def check_numeric(name: str, value: object, low: float = -math.inf, high: float 
         raise InputError(f"{name}={value!r}: {expected}")
     if not low <= value <= high or math.isinf(value):
         raise InputError(f"{name}={value}: {expected}")
+
+
+def check_until(value: object, name: str = "until") -> None:
+    """Refuse ends that are neither a positive step nor a fraction of the run.
+
+    Raises:
+        InputError: naming the argument and its value.
+    """
+    if isinstance(value, (int, float)):
+        try:
+            end_step(value, 0, 1)
+        except InputError as error:
+            raise InputError(str(error).replace("until", name, 1)) from None
+    check_numeric(name, value)
+
+
+def fixed_end(until: Numeric, total_steps: int) -> int | None:
+    """The step that `until` stands for, or None where that depends on the step itself."""
+    if isinstance(until, Schedule) or callable(until):
+        return None
+    return end_step(until, 0, total_steps)
 
 
 def _progress(step: int, begin: Numeric, until: Numeric, total_steps: int) -> float:

@@ -62,18 +62,20 @@ class Site:
         grids: selectors of the raw tensors behind the site; `None` means those of `mask` that are parameters.
     """
 
-    mask: tuple[Selector, ...] = ()
-    grids: tuple[Selector, ...] | None = None
+    mask: Selector | Sequence[Selector] = ()
+    grids: Selector | Sequence[Selector] | None = None
 
     def __post_init__(self) -> None:
-        """Accept a single selector for a tuple of one."""
-        mask = (self.mask,) if isinstance(self.mask, Selector) else tuple(self.mask)
-        grids = self.grids
-        if grids is None:
-            grids = tuple(selector for selector in mask if selector.kind == "parameters")
-        grids = (grids,) if isinstance(grids, Selector) else tuple(grids)
-        object.__setattr__(self, "mask", mask)
-        object.__setattr__(self, "grids", grids)
+        """Tuples, so that sites compare by value."""
+        object.__setattr__(self, "grids", self.selectors("grids"))
+        object.__setattr__(self, "mask", self.selectors("mask"))
+
+    def selectors(self, part: Literal["mask", "grids"]) -> tuple[Selector, ...]:
+        """The selectors of one part."""
+        chosen = self.mask if part == "mask" else self.grids
+        if chosen is None:
+            return tuple(selector for selector in self.selectors("mask") if selector.kind == "parameters")
+        return (chosen,) if isinstance(chosen, Selector) else tuple(chosen)
 
 
 SiteLike: TypeAlias = str | Selector | Site
