@@ -142,3 +142,28 @@ def orthogonality(lines: Array) -> float:
     """TensoRF's vectorDiffs: the mean absolute dot product of different rows."""
     dots = [abs(float(a @ b)) for i, a in enumerate(lines) for j, b in enumerate(lines) if i != j]
     return mean(dots)
+
+
+def fourier_low_pass(values: Array, axes: tuple[int, ...], keep: float, boundary: str = "periodic") -> Array:
+    """Axis by axis: transform, multiply each frequency, transform back. A mirror doubles the signal first."""
+    for axis in axes:
+        lines = np.moveaxis(values, axis, -1)
+        size = lines.shape[-1]
+        highest = size // 2 if boundary == "periodic" else size - 1
+        signal = lines if boundary == "periodic" else np.concatenate([lines, lines[..., ::-1]], -1)
+        spectrum = np.fft.rfft(signal)
+        factors = np.clip(keep * highest - np.arange(spectrum.shape[-1]) + 1, 0, 1)
+        values = np.moveaxis(np.fft.irfft(spectrum * factors, signal.shape[-1])[..., :size], -1, axis)
+    return values
+
+
+def gaussian_blur(values: Array, axes: tuple[int, ...], radius: float) -> Array:
+    """Axis by axis: the continued Gaussian's transform, on the signal followed by its mirror image."""
+    for axis in axes:
+        lines = np.moveaxis(values, axis, -1)
+        size = lines.shape[-1]
+        spectrum = np.fft.rfft(np.concatenate([lines, lines[..., ::-1]], -1))
+        angles = 2 * np.pi * np.arange(spectrum.shape[-1]) / (2 * size)
+        factors = np.exp(-((angles * radius * (size - 1)) ** 2) / 2)
+        values = np.moveaxis(np.fft.irfft(spectrum * factors, 2 * size)[..., :size], -1, axis)
+    return values
