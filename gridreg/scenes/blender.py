@@ -111,6 +111,7 @@ def _number(values: dict[str, Any], key: str, where: str) -> float | None:
     value = values.get(key)
     if value is None:
         return None
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise InputError(f"{where}: {key} is {value!r}, expected a finite number")
+    # Not math.isfinite: JSON allows integers too large for it.
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e100:
+        raise InputError(f"{where}: {key} is {str(value)[:40]!r}, expected a finite number")
     return float(value)

@@ -157,7 +157,7 @@ class _ViewReader:
             image = read_rgba(path, opaque=self.opaque)
             height, width = image.shape[:2]
             self._check_size(path, frame, width, height)
-            factor = self._factor(width, path)
+            factor = self._factor(width, height, path)
             values = np.array(frame.camera.intrinsics(width, height)) / factor
             digest.update(f"{i} {factor} {image.shape}".encode() + frame.pose.tobytes() + values.tobytes())
             digest.update(image.tobytes())
@@ -187,12 +187,16 @@ class _ViewReader:
                 f"{path}: image is {width}x{height}, expected {self.stored[0]}x{self.stored[1]} as before"
             )
 
-    def _factor(self, width: int, path: Path) -> int:
+    def _factor(self, width: int, height: int, path: Path) -> int:
         if self.size is None:
-            return 2 if width == self.protocol.halve_at else 1
-        if self.size < 1 or width % self.size:
+            factor = 2 if width == self.protocol.halve_at else 1
+        elif self.size < 1 or width % self.size:
             raise InputError(f"size: found {self.size}, expected a divisor of the width of {path}, {width}")
-        return width // self.size
+        else:
+            factor = width // self.size
+        if height % factor:
+            raise InputError(f"{path}: image is {width}x{height}, expected edges divisible by {factor}")
+        return factor
 
 
 def _unique_names(folder: Path, paths: list[Path]) -> tuple[str, ...]:

@@ -105,7 +105,7 @@ def _ring(count: int, radius: float, x: float, y: float, z: float, first: float 
 
 
 def _island() -> Iterator[Part]:
-    rock = Material(strata((0.44, 0.38, 0.34), (0.62, 0.56, 0.50), thickness=0.11))
+    rock = Material(strata((0.56, 0.48, 0.42), (0.82, 0.75, 0.66), thickness=0.11))
     grass = Material(speckle((0.22, 0.42, 0.16), (0.45, 0.62, 0.24), grain=0.055))
     yield _at(Frustum(0.98, 0.95, 0.10), (0, 0, -0.60), grass)
     # Solids overlap rather than touch: faces that coincide would count as surface from both sides.
