@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
+import numpy as np
 import torch
 from torch import Tensor
+
+from gridreg.export.cameras import look_at
+from gridreg.scenes import Views
 
 Function = Callable[[Tensor], Tensor]
 
@@ -62,3 +67,30 @@ def torus(major: float, minor: float, density: float = 1000.0) -> Function:
 def union(*functions: Function) -> Function:
     """Where any of them is, with the largest density."""
     return lambda x: torch.stack([f(x) for f in functions]).amax(dim=0)
+
+
+def ring_of_views(
+    count: int,
+    radius: float = 3.0,
+    elevation: float | tuple[float, float] = 25.0,
+    size: tuple[int, int] = (30, 40),
+) -> Views:
+    """Cameras around the origin, z up, the first on the x axis; white pictures.
+
+    Args:
+        count: number of views, evenly spread.
+        radius: distance from the origin.
+        elevation: degrees, or the range over which it swings.
+        size: height and width.
+    """
+    low, high = (elevation, elevation) if isinstance(elevation, float) else elevation
+    poses = []
+    for i in range(count):
+        azimuth = 2 * math.pi * i / count
+        height = math.radians((low + high) / 2 + (high - low) / 2 * math.sin(2 * azimuth))
+        place = (math.cos(height) * math.cos(azimuth), math.cos(height) * math.sin(azimuth), math.sin(height))
+        poses.append(look_at(radius * np.array(place), np.zeros(3), np.array([0.0, 0.0, 1.0])))
+    focal = 1.2 * size[1]
+    intrinsics = torch.tensor([[focal, focal, size[1] / 2, size[0] / 2]]).repeat(count, 1)
+    names = tuple(f"view_{i}" for i in range(count))
+    return Views(torch.ones(count, *size, 4), torch.stack(poses), intrinsics, names, tuple(range(count)))

@@ -1,5 +1,37 @@
 """What leaves the program: meshes, films, and a look at the field in a browser."""
 
+from gridreg.export.camera_files import load_cameras, save_cameras
+from gridreg.export.camera_paths import CAMERA_PATHS, camera_path, spiral, sway, tour, turntable
+from gridreg.export.cameras import Camera, Lens, Orbit, look_at, orbit_of_box, orbit_of_views
 from gridreg.export.mesh import Mesh, extract_mesh, read_mesh, save_mesh, write_mesh
+from gridreg.export.model import Model
+from gridreg.export.pictures import MODES, picture
+from gridreg.export.video import print_progress, render_frames, render_video
 
-__all__ = ["Mesh", "extract_mesh", "read_mesh", "save_mesh", "write_mesh"]
+__all__ = [
+    "CAMERA_PATHS",
+    "MODES",
+    "Camera",
+    "Lens",
+    "Mesh",
+    "Model",
+    "Orbit",
+    "camera_path",
+    "extract_mesh",
+    "load_cameras",
+    "look_at",
+    "orbit_of_box",
+    "orbit_of_views",
+    "picture",
+    "print_progress",
+    "read_mesh",
+    "render_frames",
+    "render_video",
+    "save_cameras",
+    "save_mesh",
+    "spiral",
+    "sway",
+    "tour",
+    "turntable",
+    "write_mesh",
+]

@@ -15,7 +15,7 @@ from gridreg.errors import InputError
 from gridreg.export.marching import Faces, Vertices, drop_small_components, polygonise, vertex_normals
 from gridreg.export.volume import SeenDensity, sample_density, surface_threshold
 from gridreg.rendering import Field, OccupancyGrid
-from gridreg.training.files import writing
+from gridreg.training.files import check_output_folder, writing
 
 if TYPE_CHECKING:
     import trimesh
@@ -168,13 +168,14 @@ def _vertex_colours(
     return result
 
 
-def _check_suffix(path: Path) -> None:
+def _check_target(path: Path) -> None:
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise InputError(f"{path}: found suffix {path.suffix!r}, expected one of {', '.join(MESH_SUFFIXES)}")
+    check_output_folder(path.parent)
 
 
 def save_mesh(mesh: Mesh, path: str | Path) -> None:
-    """Write a mesh as PLY (binary), OBJ or GLB, by the suffix; whole or not at all.
+    """Write a mesh as PLY (binary), OBJ or GLB, by the suffix; whole or not at all. Folders are made.
 
     Coordinates are those of the world in every format: a GLB viewer that takes y for up shows a z-up scene
         lying.
@@ -183,7 +184,7 @@ def save_mesh(mesh: Mesh, path: str | Path) -> None:
         InputError: for another suffix, or if the place is not writable or the disk is full.
     """
     path = Path(path)
-    _check_suffix(path)
+    _check_target(path)
     with writing(path) as temporary:
         mesh.to_trimesh().export(temporary, file_type=path.suffix.lower()[1:])
 
@@ -209,7 +210,7 @@ def write_mesh(
         InputError: of either.
     """
     # Before minutes of work, not after.
-    _check_suffix(Path(path))
+    _check_target(Path(path))
     mesh = extract_mesh(field, occupancy, resolution=resolution, **options)
     save_mesh(mesh, path)
     return mesh

@@ -1,0 +1,103 @@
+"""Camera paths as files: a JSON frame list as NeRF programs write it, without pictures."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from gridreg.errors import InputError
+from gridreg.export.cameras import Camera, Lens
+from gridreg.scenes.frames import check_pose
+from gridreg.training.files import write_json
+
+__all__ = ["load_cameras", "save_cameras"]
+
+_LENS_KEYS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
+
+
+def save_cameras(path: str | Path, cameras: Sequence[Camera]) -> None:
+    """Write a camera file, whole or not at all.
+
+    Raises:
+        InputError: if the place is not writable or the disk is full.
+    """
+    frames = []
+    for camera in cameras:
+        (fx, fy, cx, cy), lens = camera.lens.intrinsics, camera.lens
+        values = (fx, fy, cx, cy, lens.width, lens.height)
+        frames.append(
+            {**dict(zip(_LENS_KEYS, values, strict=True)), "transform_matrix": camera.pose.tolist()}
+        )
+    write_json(path, {"frames": frames})
+
+
+def load_cameras(path: str | Path, lens: Lens | None = None) -> list[Camera]:
+    """Read a camera file: what `save_cameras` writes, or any ``transforms.json`` (without its pictures).
+
+    Every frame has a ``transform_matrix``. The lens (``fl_x``, or ``camera_angle_x`` in radians; optionally
+    ``fl_y``, ``cx``, ``cy``; ``w``, ``h``) is taken from the frame, else from the top of the file, else from
+    ``lens``.
+
+    Args:
+        path: the file.
+        lens: for what the file leaves out.
+
+    Raises:
+        InputError: if the file is missing, is not such a list, lacks a key, or holds what is not a rigid
+            pose.
+    """
+    path = Path(path)
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path}: cannot read the camera file: {error.strerror or error}") from error
+    except ValueError as error:
+        raise InputError(f"{path}: not a camera file: {str(error).splitlines()[0]}") from error
+    frames = data.get("frames") if isinstance(data, dict) else None
+    if not isinstance(frames, list) or not frames:
+        raise InputError(
+            f"{path}: found no list 'frames', expected at least one frame with a transform_matrix"
+        )
+    cameras = []
+    for number, frame in enumerate(frames):
+        where = f"{path}, frame {number}"
+        if not isinstance(frame, dict) or "transform_matrix" not in frame:
+            raise InputError(f"{where}: has no transform_matrix")
+        pose = torch.from_numpy(check_pose(frame["transform_matrix"], where)).float()
+        cameras.append(Camera(pose, _lens({**data, **frame}, lens, where)))
+    return cameras
+
+
+def _lens(data: dict[str, Any], default: Lens | None, where: str) -> Lens:
+    if not any(key in data for key in ("fl_x", "camera_angle_x")):
+        if default is None:
+            raise InputError(f"{where}: has no fl_x and no camera_angle_x, expected one of them")
+        return default
+    width = _number(data, "w", None if default is None else default.width, where)
+    height = _number(data, "h", None if default is None else default.height, where)
+    if width != int(width) or height != int(height):
+        raise InputError(f"{where}: found w={width}, h={height}, expected whole pixels")
+    if "fl_x" in data:
+        fx = _number(data, "fl_x", None, where)
+    else:
+        angle = torch.tensor(_number(data, "camera_angle_x", None, where), dtype=torch.float64)
+        fx = float(width / 2 / torch.tan(angle / 2))
+    fy = _number(data, "fl_y", fx, where)
+    centre = _number(data, "cx", width / 2, where), _number(data, "cy", height / 2, where)
+    try:
+        return Lens((fx, fy, *centre), int(height), int(width))
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
+
+
+def _number(data: dict[str, Any], key: str, default: float | None, where: str) -> float:
+    value = data.get(key, default)
+    if value is None:
+        raise InputError(f"{where}: has no {key}")
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e9:
+        raise InputError(f"{where}: found {key}={value!r}, expected a number")
+    return float(value)

@@ -1,0 +1,92 @@
+"""A field with all it takes to see it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gridreg import Handle
+from gridreg.errors import InputError
+from gridreg.export.cameras import Camera
+from gridreg.rendering import March, OccupancyGrid, Rays, Rendered, camera_rays, render_rays
+
+__all__ = ["Model"]
+
+
+def _white() -> Tensor:
+    return torch.ones(3)
+
+
+@dataclass(frozen=True)
+class Model:
+    """What is to be looked at.
+
+    Args:
+        field: a `gridreg.rendering.Field`.
+        occupancy: cells that may hold something.
+        march: step and range of the rays.
+        background: ``(3,)`` colour behind the field.
+        handle: of the regularizers attached to the field, if any.
+    """
+
+    field: Any
+    occupancy: OccupancyGrid
+    march: March
+    background: Tensor = field(default_factory=_white)
+    handle: Handle | None = None
+
+    @classmethod
+    def of_field(cls, field: Any, *, resolution: int = 256, background: Tensor | None = None) -> Model:
+        """A model of a field of which nothing else is known: every cell counts, the step is half a cell.
+
+        Args:
+            field: a `gridreg.rendering.Field`.
+            resolution: cells along the longest edge of the box that the step follows.
+            background: ``(3,)``; None: white.
+        """
+        if resolution < 1:
+            raise InputError(f"resolution={resolution}: expected at least 1 cell")
+        bounds: Tensor = field.bounds
+        step = 0.5 * float((bounds[1] - bounds[0]).max()) / resolution
+        colour = torch.ones(3, device=bounds.device) if background is None else background.to(bounds.device)
+        return cls(field, OccupancyGrid.full(bounds, (1, 1, 1)), March(step), colour)
+
+    @torch.no_grad()
+    def render(
+        self, camera: Camera, *, chunk: int = 1 << 14, stop: Callable[[], bool] | None = None
+    ) -> Rendered | None:
+        """A picture; the result does not depend on ``chunk``.
+
+        Args:
+            camera: from where.
+            chunk: rays at once.
+            stop: asked between chunks; True gives the picture up.
+
+        Returns:
+            colour ``(H, W, 3)`` in [0, 1], opacity and depth ``(H, W)``, or None if it was given up.
+        """
+        device = self.field.bounds.device
+        lens = camera.lens
+        rays = camera_rays(
+            camera.pose.to(device), torch.tensor(lens.intrinsics, device=device), lens.height, lens.width
+        )
+        parts = []
+        for start in range(0, len(rays), chunk):
+            if stop is not None and stop():
+                return None
+            parts.append(self._render(rays[start : start + chunk]))
+        shape = (lens.height, lens.width)
+        return Rendered(
+            torch.cat([p.colour for p in parts]).clamp(0, 1).reshape(*shape, 3),
+            torch.cat([p.opacity for p in parts]).reshape(shape),
+            torch.cat([p.depth for p in parts]).reshape(shape),
+        )
+
+    def _render(self, rays: Rays) -> Rendered:
+        rendered = render_rays(self.field, rays, self.occupancy, self.march, background=self.background)
+        # The samples would be kept for the whole picture.
+        return Rendered(rendered.colour, rendered.opacity, rendered.depth)

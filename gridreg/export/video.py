@@ -1,0 +1,124 @@
+"""Films of fields: MP4, GIF, or a folder of PNG frames."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gridreg.errors import InputError
+from gridreg.export.cameras import Camera
+from gridreg.export.model import Model
+from gridreg.export.pictures import DepthRange, Pixels, beside, check_mode, colour_bar, depth_range, picture
+from gridreg.export.writers import check_target, write_video
+from gridreg.rendering import Rendered
+
+__all__ = ["Progress", "print_progress", "render_frames", "render_video"]
+
+Progress = Callable[[int, int, float], None]
+"""Told after every frame: frames done, frames in all, seconds left."""
+
+
+def print_progress(done: int, total: int, left: float, *, stream: Any = None) -> None:
+    """One line on the terminal: frames done and time left."""
+    stream = sys.stderr if stream is None else stream
+    minutes, seconds = divmod(round(left), 60)
+    text = f"frame {done} of {total}, {minutes}:{seconds:02d} left"
+    # A log file gets a line every tenth, a terminal one line that changes.
+    if stream.isatty():
+        stream.write(f"\r{text}   " + ("\n" if done == total else ""))
+    elif done == total or done * 10 // total != (done - 1) * 10 // total:
+        stream.write(text + "\n")
+    stream.flush()
+
+
+def render_video(
+    models: Model | Sequence[Model],
+    path: str | Path,
+    cameras: Sequence[Camera],
+    *,
+    modes: Sequence[str] = ("rgb",),
+    fps: float = 30.0,
+    depths: DepthRange | None = None,
+    progress: Progress | None = None,
+) -> None:
+    """Film a field, or several fields side by side, along a path of cameras.
+
+    Args:
+        models: what to film; several lie side by side, in this order.
+        path: ``.mp4`` (H.264), ``.gif`` (colours reduced to 256 a frame, delays in hundredths of a second),
+            or a name without suffix: a folder of PNG frames.
+        cameras: one for each frame, all of one size.
+        modes: what to show of each model, side by side; see `gridreg.export.pictures.MODES`. Depth has one
+            scale for the whole film, shown at the right.
+        fps: frames per second.
+        depths: near and far end of the depth scale, world units; None: from some of the frames.
+        progress: told after every frame.
+
+    Raises:
+        InputError: for an unknown mode or suffix, without ffmpeg (MP4), or if the place is not writable.
+    """
+    check_target(Path(path), fps)
+    frames = render_frames(models, cameras, modes=modes, depths=depths)
+    write_video(path, _reported(frames, len(cameras), progress), fps)
+
+
+def render_frames(
+    models: Model | Sequence[Model],
+    cameras: Sequence[Camera],
+    *,
+    modes: Sequence[str] = ("rgb",),
+    depths: DepthRange | None = None,
+) -> Iterator[Pixels]:
+    """The frames of `render_video`, ``(H, W, 3)`` uint8, one after the other.
+
+    Raises:
+        InputError: for an unknown mode, without cameras or models, or for cameras of different sizes.
+    """
+    shown = [models] if isinstance(models, Model) else list(models)
+    for mode in modes:
+        check_mode(mode)
+    if not cameras or not shown or not modes:
+        raise InputError(
+            f"film: found {len(cameras)} cameras, {len(shown)} models, {len(modes)} modes, expected some"
+        )
+    sizes = sorted({(camera.lens.width, camera.lens.height) for camera in cameras})
+    if len(sizes) > 1:
+        raise InputError(f"cameras: found the sizes {sizes[0]} and {sizes[1]}, expected one for all frames")
+    if "depth" in modes and depths is None:
+        depths = _film_depths(shown, cameras)
+    return _frames(shown, cameras, modes, depths)
+
+
+def _frames(
+    models: Sequence[Model], cameras: Sequence[Camera], modes: Sequence[str], depths: DepthRange | None
+) -> Iterator[Pixels]:
+    for camera in cameras:
+        parts = [picture(render, mode, depths) for render in _renders(models, camera) for mode in modes]
+        if "depth" in modes and depths is not None:
+            parts.append(colour_bar(camera.lens.height, depths))
+        yield beside(parts)
+
+
+def _renders(models: Sequence[Model], camera: Camera) -> list[Rendered]:
+    renders = [model.render(camera) for model in models]
+    return [render for render in renders if render is not None]
+
+
+def _film_depths(models: Sequence[Model], cameras: Sequence[Camera], looks: int = 8) -> DepthRange:
+    """One scale for all frames, from small pictures of some of them."""
+    chosen = [cameras[i] for i in sorted({round(x) for x in np.linspace(0, len(cameras) - 1, looks)})]
+    small = [Camera(c.pose, c.lens.resized(min(64, c.lens.width))) for c in chosen]
+    return depth_range([render for camera in small for render in _renders(models, camera)])
+
+
+def _reported(frames: Iterable[Pixels], total: int, progress: Progress | None) -> Iterator[Pixels]:
+    start = time.monotonic()
+    for done, frame in enumerate(frames, start=1):
+        if progress is not None:
+            progress(done, total, (time.monotonic() - start) / done * (total - done))
+        yield frame
