@@ -3,6 +3,7 @@
 from gridreg.export.camera_files import load_cameras, save_cameras
 from gridreg.export.camera_paths import CAMERA_PATHS, camera_path, spiral, sway, tour, turntable
 from gridreg.export.cameras import Camera, Lens, Orbit, look_at, orbit_of_box, orbit_of_views
+from gridreg.export.compare import MeshComparison, compare_meshes
 from gridreg.export.mesh import Mesh, extract_mesh, read_mesh, save_mesh, write_mesh
 from gridreg.export.model import Model
 from gridreg.export.pictures import MODES, picture
@@ -14,9 +15,11 @@ __all__ = [
     "Camera",
     "Lens",
     "Mesh",
+    "MeshComparison",
     "Model",
     "Orbit",
     "camera_path",
+    "compare_meshes",
     "extract_mesh",
     "load_cameras",
     "look_at",

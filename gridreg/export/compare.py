@@ -1,0 +1,191 @@
+"""How far a mesh is from the truth: Chamfer distance, F-score, normal consistency."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import KDTree  # type: ignore[import-untyped]
+from trimesh.triangles import closest_point
+
+from gridreg.errors import InputError
+from gridreg.export.marching import face_areas
+from gridreg.export.mesh import Mesh
+
+__all__ = ["MeshComparison", "compare_meshes", "sample_surface"]
+
+Points = NDArray[np.float64]
+
+# Triangles tried for each point: those of the nearest marks on the other surface.
+_CANDIDATES = 10
+
+
+@dataclass(frozen=True)
+class MeshComparison:
+    """Figures of a mesh against the true one.
+
+    Attributes:
+        chamfer: mean of accuracy and completeness, world units.
+        accuracy: mean distance from the mesh to the truth, world units.
+        completeness: mean distance from the truth to the mesh, world units.
+        precision: share of the mesh within ``threshold`` of the truth.
+        recall: share of the truth within ``threshold`` of the mesh.
+        f_score: harmonic mean of both (Knapitsch et al., Tanks and Temples, 2017).
+        normal_consistency: mean absolute cosine between the normals of a point and of the point nearest to it
+            on the other surface, over both directions (Mescheder et al., Occupancy Networks, 2019).
+        threshold: of precision and recall, world units.
+        diagonal: of the truth's bounding box, world units.
+        chamfer_relative: chamfer as a share of the diagonal.
+        accuracy_relative: likewise.
+        completeness_relative: likewise.
+    """
+
+    chamfer: float
+    accuracy: float
+    completeness: float
+    precision: float
+    recall: float
+    f_score: float
+    normal_consistency: float
+    threshold: float
+    diagonal: float
+    chamfer_relative: float
+    accuracy_relative: float
+    completeness_relative: float
+
+    def to_dict(self) -> dict[str, float]:
+        """The figures by name, for JSON."""
+        return asdict(self)
+
+    def __str__(self) -> str:
+        """Six lines for a terminal."""
+        share = self.threshold / self.diagonal
+        return "\n".join(
+            [
+                f"Chamfer distance    {self.chamfer:.5g} ({self.chamfer_relative:.3%} of the box diagonal)",
+                f"  mesh to truth     {self.accuracy:.5g} ({self.accuracy_relative:.3%})",
+                f"  truth to mesh     {self.completeness:.5g} ({self.completeness_relative:.3%})",
+                f"F-score             {self.f_score:.4f} within {self.threshold:.4g} ({share:.2%})",
+                f"  precision, recall {self.precision:.4f}, {self.recall:.4f}",
+                f"Normal consistency  {self.normal_consistency:.4f}",
+            ]
+        )
+
+
+def sample_surface(mesh: Mesh, count: int, generator: torch.Generator) -> tuple[Points, NDArray[np.int64]]:
+    """Points spread evenly by area over a mesh, and the face of each.
+
+    Args:
+        mesh: with some area.
+        count: number of points.
+        generator: of the random numbers.
+
+    Returns:
+        Positions ``(count, 3)`` in world units, faces ``(count,)``.
+
+    Raises:
+        InputError: for less than one point, or a mesh without area.
+    """
+    if count < 1:
+        raise InputError(f"samples={count}: expected at least 1 point")
+    edges = np.cumsum(face_areas(mesh.vertices, mesh.faces))
+    if not len(edges) or not 0 < edges[-1] < np.inf:
+        raise InputError(f"mesh: found {len(edges)} faces without area, expected a surface")
+    draws = torch.rand((count, 3), generator=generator, dtype=torch.float64).numpy()
+    face = np.searchsorted(edges, draws[:, 0] * edges[-1], side="right").clip(max=len(edges) - 1)
+    # Folding the unit square over its diagonal makes it a triangle.
+    u, v = draws[:, 1], draws[:, 2]
+    outside = u + v > 1
+    u, v = np.where(outside, 1 - u, u)[:, None], np.where(outside, 1 - v, v)[:, None]
+    a, b, c = (mesh.vertices[mesh.faces[face, k]] for k in range(3))
+    return a + u * (b - a) + v * (c - a), face.astype(np.int64)
+
+
+def _unit_normals(mesh: Mesh) -> Points:
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    normals = np.cross(b - a, c - a)
+    length: Points = np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.asarray(normals / np.maximum(length, np.finfo(np.float64).tiny))
+
+
+def _nearest(
+    points: Points, mesh: Mesh, samples: Points, faces: NDArray[np.int64]
+) -> tuple[Points, NDArray[np.int64]]:
+    """Distance ``(N,)`` of points to a mesh, and the nearest face of each.
+
+    The distance to the nearest sample alone would be too large by about half the spacing of the samples. So
+    samples (large triangles have many) and centroids (small ones may have no sample) only mark the triangles
+    to be measured.
+    """
+    marks = np.concatenate([samples, mesh.vertices[mesh.faces].mean(axis=1)])
+    faces = np.concatenate([faces, np.arange(len(mesh.faces))])
+    _, near = KDTree(marks).query(points, k=[*range(1, min(_CANDIDATES, len(marks)) + 1)])
+    best = np.full(len(points), np.inf)
+    face = np.zeros(len(points), np.int64)
+    for candidate in faces[near].T:
+        triangles = mesh.vertices[mesh.faces[candidate]]
+        nearest = closest_point(triangles, points)  # type: ignore[no-untyped-call]
+        distance = np.linalg.norm(nearest - points, axis=1)
+        closer = distance < best
+        best, face = np.where(closer, distance, best), np.where(closer, candidate, face)
+    return best, face
+
+
+def compare_meshes(
+    mesh: Mesh,
+    truth: Mesh,
+    *,
+    threshold: float | None = None,
+    samples: int = 50_000,
+    generator: torch.Generator | None = None,
+) -> MeshComparison:
+    """Compare a mesh with the true one.
+
+    Points are drawn evenly by area from both surfaces; each gets its distance to the other surface (to
+    triangles, not to the other's samples) and the angle between both normals.
+
+    Args:
+        mesh: the reconstruction.
+        truth: what it should be, in the same coordinates.
+        threshold: for the F-score, world units; None: 1 % of the diagonal of the truth's bounding box.
+        samples: points drawn from each surface; the figures scatter by about their spread over the root of
+        this.
+        generator: of the points; None: one seeded with 0.
+
+    Raises:
+        InputError: for a mesh without area or arguments out of range.
+    """
+    generator = torch.Generator().manual_seed(0) if generator is None else generator
+    used = truth.vertices[np.unique(truth.faces)] if len(truth.faces) else np.zeros((1, 3))
+    diagonal = float(np.linalg.norm(used.max(axis=0) - used.min(axis=0)))
+    threshold = 0.01 * diagonal if threshold is None else threshold
+    points, faces = sample_surface(mesh, samples, generator)
+    true_points, true_faces = sample_surface(truth, samples, generator)
+    if not 0 < threshold < np.inf:
+        raise InputError(f"threshold={threshold}: expected a distance in world units above 0")
+    to_truth, nearest_true = _nearest(points, truth, true_points, true_faces)
+    to_mesh, nearest = _nearest(true_points, mesh, points, faces)
+    normals, true_normals = _unit_normals(mesh), _unit_normals(truth)
+    cosines = [
+        np.abs((normals[faces] * true_normals[nearest_true]).sum(axis=1)).mean(),
+        np.abs((true_normals[true_faces] * normals[nearest]).sum(axis=1)).mean(),
+    ]
+    accuracy, completeness = float(to_truth.mean()), float(to_mesh.mean())
+    precision, recall = float((to_truth < threshold).mean()), float((to_mesh < threshold).mean())
+    chamfer = (accuracy + completeness) / 2
+    return MeshComparison(
+        chamfer=chamfer,
+        accuracy=accuracy,
+        completeness=completeness,
+        precision=precision,
+        recall=recall,
+        f_score=2 * precision * recall / (precision + recall) if precision + recall > 0 else 0.0,
+        normal_consistency=float(np.mean(cosines)),
+        threshold=threshold,
+        diagonal=diagonal,
+        chamfer_relative=chamfer / diagonal,
+        accuracy_relative=accuracy / diagonal,
+        completeness_relative=completeness / diagonal,
+    )
