@@ -6,7 +6,6 @@ Nothing here needs a display: figures are drawn by matplotlib's Agg backend, wit
 from __future__ import annotations
 
 import json
-import math
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -18,7 +17,7 @@ from matplotlib.figure import Figure
 
 from gridreg.errors import InputError
 from gridreg.training.files import write_text, writing
-from gridreg.training.metrics import json_number
+from gridreg.training.metrics import json_ready
 
 __all__ = ["History", "draw_curves", "draw_masks"]
 
@@ -90,7 +89,7 @@ class History:
         Raises:
             InputError: if the place is not writable or the disk is full.
         """
-        lines = [json.dumps({key: _plain(value) for key, value in row.items()}) for row in self.rows]
+        lines = [json.dumps(json_ready(row)) for row in self.rows]
         write_text(path, "".join(line + "\n" for line in lines))
 
     @classmethod
@@ -207,12 +206,3 @@ def _draw_series(axes: Axes, name: str, rows: Sequence[Row]) -> None:
 def _verbatim(text: str) -> str:
     """Text that matplotlib takes as it is, also where a dollar would begin a formula."""
     return text.replace("$", r"\$")
-
-
-def _plain(value: Any) -> Any:
-    """A row's value without infinities, masks included."""
-    if isinstance(value, dict):
-        return {key: _plain(inner) for key, inner in value.items()}
-    if isinstance(value, list):
-        return [_plain(inner) for inner in value]
-    return json_number(value) if isinstance(value, float) and not math.isfinite(value) else value

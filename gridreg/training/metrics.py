@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
@@ -29,6 +29,7 @@ __all__ = [
     "SsimConvention",
     "image_metrics",
     "json_number",
+    "json_ready",
     "mean_metrics",
     "mean_psnr",
     "mse_to_psnr",
@@ -170,6 +171,20 @@ def json_number(value: float) -> float | str:
         (25.5, 'inf')
     """
     return float(value) if math.isfinite(value) else str(float(value))
+
+
+def json_ready(value: Any) -> Any:
+    """Plain data in which every float is one that JSON has, see ``json_number``; tuples become lists.
+
+    Example:
+        >>> json_ready({"psnr": math.inf, "steps": (1, 2)})
+        {'psnr': 'inf', 'steps': [1, 2]}
+    """
+    if isinstance(value, Mapping):
+        return {str(key): json_ready(inner) for key, inner in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [json_ready(inner) for inner in value]
+    return json_number(value) if isinstance(value, float) else value
 
 
 def _pair(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:

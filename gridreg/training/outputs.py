@@ -1,0 +1,276 @@
+"""What a scored run leaves: renders beside targets, error maps, depth, and ``metrics.json``."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from gridreg.errors import InputError
+from gridreg.training.files import write_json
+from gridreg.training.metrics import json_ready, mean_metrics
+from gridreg.training.pictures import (
+    Picture,
+    coloured,
+    labelled,
+    row,
+    save_png,
+    scale_bar,
+    thumbnail,
+    to_picture,
+)
+from gridreg.training.versions import versions
+
+__all__ = [
+    "CONVENTIONS",
+    "comparison",
+    "depth_picture",
+    "error_map",
+    "metrics_record",
+    "save_contact_sheet",
+    "save_metrics",
+    "save_view",
+]
+
+MAX_ERROR = 0.5
+"""Upper end of the error maps' scale; fixed, so that pictures of different runs compare."""
+
+CONVENTIONS = {
+    "psnr": "dB; mean over images of -10 log10(MSE), images in [0, 1] after clamping",
+    "ssim_gaussian": "11x11 Gaussian window, sigma 1.5, population covariance (TensoRF and most)",
+    "ssim_uniform": "7x7 uniform window, sample covariance (FreeNeRF, scikit-image's default)",
+}
+"""What each metric in ``metrics.json`` means."""
+
+
+def error_map(image: Tensor, target: Tensor, max_error: float = MAX_ERROR) -> Picture:
+    """The error of each pixel, root mean square over the channels, as a colour from black to light yellow.
+
+    Args:
+        image: ``(H, W, 3)`` in [0, 1].
+        target: the same shape.
+        max_error: the error that gets the last colour.
+
+    Raises:
+        InputError: if the shapes differ.
+    """
+    return coloured(_error(image, target), 0.0, max_error)
+
+
+def comparison(
+    image: Tensor, target: Tensor, *, metrics: Mapping[str, float] | None = None, max_error: float = MAX_ERROR
+) -> Picture:
+    """Target, render and error map side by side, with labels and the error's scale.
+
+    Small images are enlarged by whole pixels, so that the labels are readable.
+
+    Args:
+        image: the render, ``(H, W, 3)`` in [0, 1].
+        target: the same shape.
+        metrics: of this image, for the label; ``psnr`` and ``ssim_gaussian`` are shown.
+        max_error: upper end of the error's scale.
+
+    Raises:
+        InputError: if the shapes differ or are not ``(H, W, 3)``.
+    """
+    zoom = max(1, math.ceil(200 / max(image.shape[:2])))
+    size = zoom * max(image.shape[:2])
+    label = "render"
+    if metrics and "psnr" in metrics:
+        label += f"  {metrics['psnr']:.2f} dB"
+    if metrics and "ssim_gaussian" in metrics:
+        label += f"  SSIM {metrics['ssim_gaussian']:.3f}"
+    error = thumbnail(error_map(image, target, max_error), size)
+    return row(
+        [
+            labelled(thumbnail(to_picture(target), size), "target"),
+            labelled(thumbnail(to_picture(image), size), label),
+            labelled(error, "error (RMS of channels)"),
+            labelled(scale_bar(error.shape[0], 0.0, max_error), ""),
+        ]
+    )
+
+
+def depth_picture(depth: Tensor, opacity: Tensor) -> Picture:
+    """The mean distance of what each pixel hits, bright is near, with its scale in world units.
+
+    The scale reaches from the 1st to the 99th percentile of the pixels with an opacity over 0.5; the others
+    fade into white.
+
+    Args:
+        depth: ``(H, W)`` weighted sum of distances along the ray (0 where nothing is hit).
+        opacity: ``(H, W)`` in [0, 1].
+
+    Raises:
+        InputError: if the shapes differ.
+    """
+    if depth.shape != opacity.shape or depth.ndim != 2:
+        raise InputError(
+            f"depth, opacity: {tuple(depth.shape)}, {tuple(opacity.shape)}; expected (H, W) both"
+        )
+    share = opacity.detach().double().nan_to_num(0).clamp(0, 1).cpu().numpy()
+    distance = depth.detach().double().nan_to_num(0).cpu().numpy() / np.maximum(share, 1e-6)
+    seen = distance[share > 0.5]
+    near, far = (float(v) for v in np.quantile(seen, [0.01, 0.99])) if seen.size else (0.0, 1.0)
+    far = max(far, near + 1e-3)
+    picture = coloured(distance, near, far, "viridis_r")
+    blended = picture * share[..., None] + 255 * (1 - share[..., None])
+    zoom = max(1, math.ceil(200 / max(share.shape)))
+    body = thumbnail(np.round(blended).astype(np.uint8), zoom * max(share.shape))
+    return row([body, scale_bar(body.shape[0], near, far, "viridis_r", "depth")])
+
+
+def save_view(
+    folder: str | os.PathLike[str],
+    name: str,
+    image: Tensor,
+    target: Tensor,
+    *,
+    depth: Tensor | None = None,
+    opacity: Tensor | None = None,
+    metrics: Mapping[str, float] | None = None,
+) -> None:
+    """Write one scored view: ``NAME.png`` (the render alone), ``NAME_compare.png`` and ``NAME_depth.png``.
+
+    Args:
+        folder: where to; must exist.
+        name: of the view, fit for a file name.
+        image: the render, ``(H, W, 3)`` in [0, 1].
+        target: the same shape, on the same background.
+        depth: ``(H, W)``, see ``depth_picture``; without it and ``opacity`` there is no depth picture.
+        opacity: ``(H, W)``.
+        metrics: of this view, for the label.
+
+    Raises:
+        InputError: if the shapes do not fit, or the place is not writable.
+    """
+    place = Path(folder)
+    save_png(place / f"{name}.png", to_picture(image))
+    save_png(place / f"{name}_compare.png", comparison(image, target, metrics=metrics))
+    if depth is not None and opacity is not None:
+        save_png(place / f"{name}_depth.png", depth_picture(depth, opacity))
+
+
+def save_contact_sheet(
+    path: str | os.PathLike[str],
+    names: Sequence[str],
+    images: Sequence[Tensor],
+    targets: Sequence[Tensor],
+    *,
+    psnrs: Sequence[float] | None = None,
+    columns: int = 5,
+    size: int = 160,
+) -> None:
+    """Write one PNG with all views small: target and render side by side, name and PSNR above.
+
+    Args:
+        path: the PNG.
+        names: of the views, ``V`` of them.
+        images: the renders, ``(H, W, 3)`` each.
+        targets: likewise.
+        psnrs: of the views, dB.
+        columns: pairs in a row.
+        size: longer side of a small picture, pixels.
+
+    Raises:
+        InputError: if there is no view, the numbers differ, or the place is not writable.
+    """
+    if not names or not len(names) == len(images) == len(targets):
+        raise InputError(
+            f"names, images, targets: {len(names)}, {len(images)}, {len(targets)}; expected as many of each"
+        )
+    cells = []
+    for index, (name, image, target) in enumerate(zip(names, images, targets, strict=True)):
+        pair = row([thumbnail(to_picture(target), size), thumbnail(to_picture(image), size)], gap=1)
+        cells.append(labelled(pair, f"{name}  {psnrs[index]:.2f} dB" if psnrs is not None else name))
+    rows = [row(cells[start : start + columns], gap=8) for start in range(0, len(cells), columns)]
+    width = max(picture.shape[1] for picture in rows)
+    padded = [
+        np.pad(picture, ((0, 8), (0, width - picture.shape[1]), (0, 0)), constant_values=255)
+        for picture in rows
+    ]
+    save_png(path, np.concatenate(padded))
+
+
+def metrics_record(
+    views: Mapping[str, Mapping[str, float]],
+    *,
+    scene: str,
+    protocol: str,
+    builtin: bool,
+    seed: int,
+    steps: int,
+    seconds: Mapping[str, float],
+    config: Mapping[str, Any],
+    command: Sequence[str] = (),
+    train_views: Sequence[str] = (),
+    conventions: Mapping[str, str] | None = None,
+    **more: Any,
+) -> dict[str, Any]:
+    """The content of ``metrics.json``: scores of each view and their mean, and all it takes to judge them.
+
+    Args:
+        views: metrics by name of the test view.
+        scene: name of the scene.
+        protocol: name of the protocol.
+        builtin: whether the scene is the project's own. Then ``"benchmark"`` is false and the scene's name
+        says so,
+            because its figures must not stand beside published ones.
+        seed: of the run.
+        steps: iterations done.
+        seconds: by phase, such as ``train`` and ``test``.
+        config: the configuration, plain data.
+        command: the command line.
+        train_views: names of the training views.
+        conventions: what further metrics mean, beside ``CONVENTIONS`` (for LPIPS: network and input range).
+        more: further plain data.
+
+    Raises:
+        InputError: if there is no view, or the views do not have the same metrics.
+    """
+    mean = mean_metrics(list(views.values()))
+    known = {**CONVENTIONS, **(conventions or {})}
+    record = {
+        "scene": f"{scene} (built-in, no benchmark)" if builtin else scene,
+        "builtin": builtin,
+        "benchmark": not builtin,
+        "protocol": protocol,
+        "mean": mean,
+        "images": {name: dict(values) for name, values in views.items()},
+        "conventions": {name: known[name] for name in mean if name in known},
+        "train_views": list(train_views),
+        "test_views": len(views),
+        "steps": steps,
+        "seed": seed,
+        "seconds": dict(seconds),
+        "command": list(command),
+        "config": dict(config),
+        "versions": versions(),
+        **more,
+    }
+    ready: dict[str, Any] = json_ready(record)
+    return ready
+
+
+def save_metrics(path: str | os.PathLike[str], record: Mapping[str, Any]) -> None:
+    """Write ``metrics_record`` as JSON with sorted keys, whole or not at all.
+
+    Raises:
+        InputError: if the place is not writable or the disk is full.
+    """
+    write_json(path, record)
+
+
+def _error(image: Tensor, target: Tensor) -> np.ndarray[Any, np.dtype[np.float64]]:
+    if image.shape != target.shape:
+        raise InputError(
+            f"image, target: {tuple(image.shape)} and {tuple(target.shape)}; expected equal shapes"
+        )
+    difference = (image.detach().double().clamp(0, 1) - target.detach().double().clamp(0, 1)).cpu()
+    error: np.ndarray[Any, np.dtype[np.float64]] = difference.square().mean(-1).sqrt().numpy()
+    return error

@@ -1,0 +1,265 @@
+"""Renders beside targets, error maps, depth, contact sheets, and what metrics.json says."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import imageio.v3 as iio
+import matplotlib
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from gridreg.errors import InputError
+from gridreg.training import outputs, pictures
+from gridreg.training.metrics import image_metrics
+from gridreg.training.versions import cpu_model, package_version, versions
+
+
+def inferno(share: np.ndarray) -> np.ndarray:
+    """The colour scale, written independently of the code under test."""
+    return np.round(matplotlib.colormaps["inferno"](np.round(share * 255).astype(int))[..., :3] * 255)
+
+
+@pytest.fixture
+def pair() -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    target = torch.rand(30, 40, 3, generator=generator)
+    return (target + 0.2 * torch.rand(30, 40, 3, generator=generator)).clamp(0, 1), target
+
+
+def test_to_picture_rounds_and_clamps():
+    image = torch.tensor([[[-1.0, 0.0, 0.499 / 255], [0.501 / 255, 2.0, math.nan]]])
+    assert pictures.to_picture(image).tolist() == [[[0, 0, 0], [1, 255, 0]]]
+    with pytest.raises(InputError, match=r"expected \(H, W, 3\)"):
+        pictures.to_picture(torch.zeros(3, 4))
+
+
+def test_error_map_is_the_rms_over_channels(pair):
+    image, target = pair
+    expected = np.sqrt(((image.double() - target.double()).numpy() ** 2).mean(-1)) / outputs.MAX_ERROR
+    got = outputs.error_map(image, target)
+    assert got.dtype == np.uint8
+    assert np.abs(got - inferno(np.clip(expected, 0, 1))).max() <= 1
+
+
+def test_error_map_ends(pair):
+    _, target = pair
+    assert (outputs.error_map(target, target) == inferno(np.zeros(1))).all()
+    assert (outputs.error_map(torch.ones(4, 4, 3), torch.zeros(4, 4, 3)) == inferno(np.ones(1))).all()
+    nan = torch.full((4, 4, 3), math.nan)
+    assert (outputs.error_map(nan, torch.zeros(4, 4, 3)) == inferno(np.ones(1))).all()
+
+
+def test_comparison_holds_target_render_and_error_in_this_order():
+    generator = torch.Generator().manual_seed(1)
+    image, target = torch.rand(2, 220, 210, 3, generator=generator)
+    picture = outputs.comparison(image, target, metrics={"psnr": 20.123, "ssim_gaussian": 0.5})
+    body = picture[-220:]
+    assert np.array_equal(body[:, :210], pictures.to_picture(target))
+    assert np.array_equal(body[:, 214:424], pictures.to_picture(image))
+    assert np.array_equal(body[:, 428:638], outputs.error_map(image, target))
+    assert picture.shape[1] > 638 + 40
+    strip = picture[:-220]
+    for left in (0, 214, 428):
+        assert (strip[:, left : left + 210] < 128).any()
+
+
+def test_small_images_are_enlarged_by_whole_pixels(pair):
+    image, target = pair
+    picture = outputs.comparison(image, target)
+    body = picture[-150:]
+    assert np.array_equal(body[:, :200], pictures.to_picture(target).repeat(5, 0).repeat(5, 1))
+
+
+def test_labels_are_cut_and_not_wrapped():
+    picture = np.zeros((5, 30, 3), np.uint8)
+    got = pictures.labelled(picture, "a label that is much wider than thirty pixels")
+    assert got.shape[1:] == (30, 3)
+    assert np.array_equal(got[-5:], picture)
+
+
+@pytest.mark.parametrize("height", [2, 5, 20, 100, 400])
+def test_scale_bar_goes_from_low_below_to_high_above(height):
+    bar = pictures.scale_bar(height, 0.0, 2.0)
+    assert bar.shape == pictures.scale_bar(height, 0.0, 2.0, unit="depth").shape == (height, 64, 3)
+    ramp = bar[:, 10].astype(int)
+    coloured = ramp[(ramp != 255).any(-1)]
+    assert len(coloured) >= 2
+    assert coloured[0].sum() > coloured[-1].sum()
+
+
+def test_the_unit_stands_above_the_scale():
+    with_unit, without = (pictures.scale_bar(200, 0.0, 1.0, unit=unit)[:16] for unit in ("depth", ""))
+    assert (with_unit < 128).any()
+    assert (without[:, :20][:8] == 255).all()
+
+
+def test_rows_and_thumbnails():
+    low, high = np.zeros((2, 3, 3), np.uint8), np.full((4, 1, 3), 7, np.uint8)
+    got = pictures.row([low, high], gap=2)
+    assert got.shape == (4, 6, 3)
+    assert (got[:2, :3] == 0).all()
+    assert (got[2:, :3] == 255).all()
+    assert (got[:, 3:5] == 255).all()
+    assert (got[:, 5] == 7).all()
+    assert pictures.thumbnail(np.zeros((100, 50, 3), np.uint8), 10).shape == (10, 5, 3)
+    assert pictures.thumbnail(np.zeros((1, 1000, 3), np.uint8), 10).shape == (1, 10, 3)
+
+
+def test_depth_is_the_mean_distance_near_is_bright_and_nothing_is_white():
+    distance = torch.linspace(2, 6, 300)[None, :].expand(240, 300)
+    opacity = torch.full((240, 300), 0.8)
+    opacity[:120] = 0
+    picture = outputs.depth_picture(distance * opacity, opacity)[:, :300].astype(int)
+    assert (picture[:120] == 255).all()
+    brightness = picture[200].sum(-1)
+    assert brightness[5] > brightness[150] > brightness[294]
+    scale = matplotlib.colormaps["viridis_r"]
+    # 4 world units stand in the middle of the scale, blended with white by the opacity.
+    expected = 0.8 * np.array(scale(0.5)[:3]) * 255 + 0.2 * 255
+    assert np.abs(picture[200, 150] - expected).max() <= 4
+
+
+@pytest.mark.parametrize("opacity", [0.0, 1.0, math.nan])
+def test_depth_of_nothing_and_of_a_flat_wall(opacity):
+    opacities = torch.full((20, 20), opacity)
+    picture = outputs.depth_picture(3 * opacities, opacities)
+    assert picture.shape[0] == 200
+    white = (picture[:, :200] == 255).all()
+    assert white == (opacity != 1.0)
+
+
+def test_save_view_writes_three_pictures(tmp_path, pair):
+    image, target = pair
+    depth = torch.ones(30, 40)
+    outputs.save_view(tmp_path, "r_0", image, target, depth=depth, opacity=depth, metrics={"psnr": math.inf})
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["r_0.png", "r_0_compare.png", "r_0_depth.png"]
+    assert np.array_equal(iio.imread(tmp_path / "r_0.png"), pictures.to_picture(image))
+    assert np.array_equal(iio.imread(tmp_path / "r_0_compare.png")[-150:, :200], picture_of(target))
+    outputs.save_view(tmp_path, "r_8", image, target)
+    assert not (tmp_path / "r_8_depth.png").exists()
+
+
+def picture_of(image: Tensor) -> np.ndarray:
+    return pictures.to_picture(image).repeat(5, 0).repeat(5, 1)
+
+
+@pytest.mark.parametrize("count", [1, 4, 7])
+def test_contact_sheet_holds_every_pair(tmp_path, count):
+    images = [torch.full((20, 20, 3), (i + 1) / 10) for i in range(count)]
+    targets = [torch.full((20, 20, 3), (i + 1) / 20) for i in range(count)]
+    names = [f"r_{i}" for i in range(count)]
+    path = tmp_path / "sheet.png"
+    outputs.save_contact_sheet(path, names, images, targets, psnrs=[20.0] * count, columns=3, size=40)
+    sheet = iio.imread(path)
+    for index in range(count):
+        line, column = divmod(index, 3)
+        y, x = line * (40 + 20 + 8) + 20 + 20, column * (81 + 8) + 20
+        assert (sheet[y, x] == pictures.to_picture(targets[index])[0, 0]).all()
+        assert (sheet[y, x + 41] == pictures.to_picture(images[index])[0, 0]).all()
+
+
+@pytest.mark.parametrize("names", [[], ["a", "b"]])
+def test_contact_sheet_of_nothing_or_of_unequal_numbers(tmp_path, names):
+    with pytest.raises(InputError, match="expected as many of each"):
+        outputs.save_contact_sheet(tmp_path / "sheet.png", names, [], [])
+
+
+def test_shapes_that_do_not_fit(pair):
+    image, target = pair
+    with pytest.raises(InputError, match="expected equal shapes"):
+        outputs.comparison(image[:-1], target)
+    with pytest.raises(InputError, match=r"expected \(H, W\) both"):
+        outputs.depth_picture(torch.zeros(3, 3), torch.zeros(3, 4))
+
+
+def test_an_unwritable_place_is_one_line(tmp_path, pair):
+    with pytest.raises(InputError, match=r"none/r_0\.png: cannot write here") as caught:
+        outputs.save_view(tmp_path / "none", "r_0", *pair)
+    assert "\n" not in str(caught.value)
+
+
+def record(pair: tuple[Tensor, Tensor], **changes: object) -> dict[str, object]:
+    image, target = pair
+    views = {"r_0": image_metrics(image, target), "r_8": image_metrics(target, target)}
+    options: dict[str, object] = {
+        "scene": "lego",
+        "protocol": "dietnerf8",
+        "builtin": False,
+        "seed": 3,
+        "steps": 100,
+        "seconds": {"train": 1.5, "test": 0.25},
+        "config": {"until": math.inf, "resample_at": (2, 3)},
+        "command": ["few_tensorf_blender.py", "--steps", "100"],
+    }
+    return outputs.metrics_record(views, **{**options, **changes})  # type: ignore[arg-type]
+
+
+def test_metrics_record_says_all_it_takes_to_judge_it(tmp_path, pair):
+    outputs.save_metrics(tmp_path / "metrics.json", record(pair, carved=True))
+    saved = json.loads((tmp_path / "metrics.json").read_text())
+    assert list(saved) == sorted(saved)
+    assert saved["benchmark"] is True
+    assert saved["builtin"] is False
+    assert saved["scene"] == "lego"
+    assert saved["protocol"] == "dietnerf8"
+    assert saved["test_views"] == 2
+    assert saved["carved"] is True
+    assert saved["seconds"] == {"train": 1.5, "test": 0.25}
+    assert saved["config"] == {"until": "inf", "resample_at": [2, 3]}
+    assert saved["images"]["r_8"]["psnr"] == "inf"
+    assert saved["mean"]["psnr"] == "inf"
+    ssim = [saved["images"][name]["ssim_uniform"] for name in ("r_0", "r_8")]
+    assert saved["mean"]["ssim_uniform"] == pytest.approx(np.mean(ssim), abs=1e-15)
+    assert set(saved["conventions"]) == set(saved["mean"]) == {"psnr", "ssim_gaussian", "ssim_uniform"}
+    assert {"gridreg", "torch", "numpy", "numba", "python", "cpu", "threads"} <= set(saved["versions"])
+
+
+def test_the_built_in_scene_is_never_a_benchmark(pair):
+    saved = record(pair, builtin=True, scene="builtin")
+    assert saved["benchmark"] is False
+    assert saved["builtin"] is True
+    assert "no benchmark" in str(saved["scene"])
+
+
+def test_further_metrics_bring_their_convention():
+    saved = outputs.metrics_record(
+        {"r_0": {"psnr": 20.0, "lpips_vgg": 0.1}},
+        scene="lego",
+        protocol="gs8",
+        builtin=False,
+        seed=0,
+        steps=1,
+        seconds={},
+        config={},
+        conventions={"lpips_vgg": "VGG16, inputs in [-1, 1]"},
+    )
+    assert saved["conventions"]["lpips_vgg"] == "VGG16, inputs in [-1, 1]"
+    assert "ssim_gaussian" not in saved["conventions"]
+
+
+def test_a_run_without_test_views_has_no_metrics():
+    with pytest.raises(InputError, match="no image was evaluated"):
+        outputs.metrics_record(
+            {}, scene="x", protocol="y", builtin=False, seed=0, steps=1, seconds={}, config={}
+        )
+
+
+def test_versions_are_those_that_run():
+    found = versions()
+    assert found["torch"] == torch.__version__
+    assert found["numpy"] == np.__version__
+    assert found["threads"] == torch.get_num_threads()
+    assert int(found["cores"]) >= 1
+    assert package_version("no-such-package-anywhere") == "not installed"
+
+
+def test_cpu_model_is_read_or_replaced_by_the_architecture(tmp_path: Path):
+    (tmp_path / "cpuinfo").write_text("processor\t: 0\nmodel name\t: Some  CPU @ 2 GHz\n")
+    assert cpu_model(tmp_path / "cpuinfo") == "Some CPU @ 2 GHz"
+    (tmp_path / "cpuinfo").write_text("processor\t: 0\n")
+    assert cpu_model(tmp_path / "cpuinfo") == cpu_model(tmp_path / "missing") != ""
