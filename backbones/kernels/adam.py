@@ -1,0 +1,227 @@
+"""Adam that touches memory once: local grid terms, update and clearing of gradients in one pass."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from backbones.kernels.adam_layout import Moments, Terms, layout
+from backbones.kernels.adam_update import update
+from gridreg.base import LocalTerm
+from gridreg.errors import InputError
+from gridreg.rendering.backends import takes_compiled
+
+__all__ = ["FusedAdam"]
+
+_KINDS = ("total_variation", "l1", "l2")
+
+
+def _axes(term: LocalTerm) -> tuple[int, ...]:
+    dim = term.parameter.dim()
+    return tuple(sorted(axis % dim for axis in term.spatial)) if term.kind == "total_variation" else ()
+
+
+def _pairs(p: Tensor, axis: int) -> int:
+    """Number of neighbour pairs along an axis."""
+    return p.numel() // p.shape[axis] * (p.shape[axis] - 1)
+
+
+def _add_plainly(term: LocalTerm, gradient: Tensor) -> float:
+    """Add the gradient of a term to ``gradient``; returns the term's value."""
+    p = term.parameter.detach()
+    if term.kind == "l1":
+        gradient.add_(p.sign(), alpha=term.scale / p.numel())
+        return term.scale * float(p.abs().double().mean())
+    if term.kind == "l2":
+        gradient.add_(p, alpha=2 * term.scale / p.numel())
+        return term.scale * float(p.double().square().mean())
+    value = 0.0
+    for axis in _axes(term):
+        n, pairs = p.shape[axis], _pairs(p, axis)
+        if pairs:
+            difference = p.diff(dim=axis)
+            factor = 2 * term.scale / pairs
+            gradient.narrow(axis, 0, n - 1).sub_(difference, alpha=factor)
+            gradient.narrow(axis, 1, n - 1).add_(difference, alpha=factor)
+            value += float(difference.double().square().sum()) / pairs
+    return term.scale * value
+
+
+def _step_plainly(p: Tensor, g: Tensor, m: Tensor, v: Tensor, s: Moments) -> None:
+    if s.keep != 1:
+        p.mul_(s.keep)
+    m.lerp_(g, s.rest1)
+    v.mul_(s.beta2).addcmul_(g, g, value=s.rest2)
+    p.addcdiv_(m, v.sqrt().mul_(s.root).add_(s.eps), value=-s.rate)
+
+
+def _step_compiled(
+    p: Tensor, g: Tensor, m: Tensor, v: Tensor, s: Moments, decay: float, terms: Sequence[LocalTerm]
+) -> list[float]:
+    """One step of the kernel; returns the values of the terms, the odd ones added to the gradient before."""
+    axes: tuple[int, ...] = next(
+        (_axes(term) for term in terms if layout(p.shape, _axes(term)) and _axes(term)), ()
+    )
+    shape = layout(p.shape, axes)
+    assert shape is not None
+    # Of slabs, rows and nodes, in the order of `axes`: two axes have no rows, one has slabs alone.
+    columns = {0: (), 1: (0,), 2: (0, 2), 3: (0, 1, 2)}[len(axes)]
+    factors = [0.0] * 5
+    factors[4] = decay
+    values = [0.0] * len(terms)
+    counts = [1.0] * 5
+    counts[3] = counts[4] = p.numel()
+    for column, axis in zip(columns, axes, strict=True):
+        counts[column] = max(1, _pairs(p, axis))
+    members: dict[int, tuple[int, ...]] = {}
+    for place, term in enumerate(terms):
+        if _axes(term) != axes and term.kind == "total_variation":
+            values[place] = _add_plainly(term, g)
+            continue
+        members[place] = columns if term.kind == "total_variation" else (3,) if term.kind == "l1" else (4,)
+        for column in members[place]:
+            factors[column] += term.scale * (1 if term.kind == "l1" else 2) / counts[column]
+    sums = update(p, g, m, v, s, Terms(*factors), shape).tolist()
+    for place, own in members.items():
+        values[place] = terms[place].scale * sum(sums[column] / counts[column] for column in own)
+    return values
+
+
+class FusedAdam(torch.optim.Optimizer):
+    """`torch.optim.Adam` (Kingma and Ba 2015) in one pass over memory, with grid penalties folded in.
+
+    For contiguous float32 CPU parameters a compiled kernel reads parameter, gradient and both moments once,
+    adds the gradients of total variation, L1 and L2 terms, writes back, and sets the gradient to 0. Gradient
+    buffers stay, so that a backward pass can add to them: do not call ``zero_grad``. All other parameters
+    take a plain path with the same results.
+
+    A parameter without a gradient is left alone until its first one; from then on no gradient counts as 0.
+
+    Args:
+        params: parameters, or groups of them.
+        lr: learning rate.
+        betas: decay rates of the moments.
+        eps: added to the root of the second moment.
+        weight_decay: per step, times ``lr`` if decoupled.
+        decoupled_weight_decay: True: shrink parameters (AdamW, Loshchilov and Hutter 2019); False: add to the
+        gradient.
+
+    Raises:
+        InputError: for a setting out of range.
+
+    Example:
+        >>> grid = torch.nn.Parameter(torch.tensor([[0.0], [1.0]]))
+        >>> optimizer = FusedAdam([grid], lr=0.1)
+        >>> optimizer.step(local_terms=[LocalTerm("total_variation", 0.5, grid, (0,), "smooth")])
+        {'smooth': 0.5}
+        >>> [round(x, 3) for x in grid.flatten().tolist()]
+        [0.1, 0.9]
+    """
+
+    accepts_local_terms = True
+    zeroes_gradients = True
+
+    def __init__(
+        self,
+        params: Iterable[Any],
+        lr: float = 1e-3,
+        betas: tuple[float, float] = (0.9, 0.99),
+        eps: float = 1e-8,
+        weight_decay: float = 0.0,
+        *,
+        decoupled_weight_decay: bool = True,
+    ) -> None:
+        for name, value, high in (
+            ("lr", lr, math.inf),
+            ("betas[0]", betas[0], 1.0),
+            ("betas[1]", betas[1], 1.0),
+            ("eps", eps, math.inf),
+            ("weight_decay", weight_decay, math.inf),
+        ):
+            if not 0 <= value < high:
+                raise InputError(f"{name}: found {value}, expected a number in [0, {high})")
+        defaults = {
+            "lr": lr,
+            "betas": betas,
+            "eps": eps,
+            "weight_decay": weight_decay,
+            "decoupled_weight_decay": decoupled_weight_decay,
+        }
+        super().__init__(params, defaults)
+
+    @torch.no_grad()
+    def step(  # type: ignore[override]
+        self, closure: None = None, *, local_terms: Sequence[LocalTerm] = ()
+    ) -> dict[str, float]:
+        """Update all parameters and set their gradients to 0.
+
+        Args:
+            closure: not supported.
+            local_terms: penalties whose gradients are added; see `gridreg.base.LocalTerm`.
+
+        Returns:
+            The values of the terms before the update, by name.
+
+        Raises:
+            InputError: for a closure, or a term of an unknown kind or of a parameter that is not here.
+        """
+        if closure is not None:
+            raise InputError("closure: found a function, expected None; compute gradients before the step")
+        held = {id(p) for group in self.param_groups for p in group["params"]}
+        by_parameter: defaultdict[int, list[LocalTerm]] = defaultdict(list)
+        values = {term.name: 0.0 for term in local_terms}
+        for term in local_terms:
+            if term.kind not in _KINDS:
+                raise InputError(
+                    f"{term.name or 'term'}: found kind {term.kind!r}, expected one of {', '.join(_KINDS)}"
+                )
+            if id(term.parameter) not in held:
+                shape = tuple(term.parameter.shape)
+                raise InputError(
+                    f"{term.name or 'term'}: found a parameter {shape} that the optimizer does not hold"
+                )
+            by_parameter[id(term.parameter)].append(term)
+        for group in self.param_groups:
+            for p in group["params"]:
+                terms = by_parameter.get(id(p), [])
+                for term, value in zip(terms, self._step_one(p, group, terms), strict=True):
+                    values[term.name] += value
+        return values
+
+    def _step_one(self, p: Tensor, group: dict[str, Any], terms: Sequence[LocalTerm]) -> list[float]:
+        if p.grad is None:
+            if not terms and p not in self.state:
+                return []
+            p.grad = torch.zeros_like(p)
+        state = self.state[p]
+        if not state:
+            # Names and types as of torch.optim.Adam.
+            state["step"] = torch.tensor(0.0)
+            state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(p), torch.zeros_like(p)
+        state["step"] += 1
+        steps, (beta1, beta2), rate = int(state["step"]), group["betas"], float(group["lr"])
+        decay, decoupled = float(group["weight_decay"]), group["decoupled_weight_decay"]
+        moments = Moments(
+            rest1=1 - beta1,
+            beta2=beta2,
+            rest2=1 - beta2,
+            rate=rate / (1 - beta1**steps),
+            root=1 / math.sqrt(1 - beta2**steps),
+            eps=group["eps"],
+            keep=1 - rate * decay if decoupled else 1.0,
+        )
+        coupled = 0.0 if decoupled else decay
+        tensors = (p, p.grad, state["exp_avg"], state["exp_avg_sq"])
+        if takes_compiled(*tensors) and all(x.is_contiguous() for x in tensors) and p.numel():
+            return _step_compiled(*tensors, moments, coupled, terms)
+        values = [_add_plainly(term, p.grad) for term in terms]
+        if coupled:
+            p.grad.add_(p, alpha=coupled)
+        _step_plainly(*tensors, moments)
+        p.grad.zero_()
+        return values

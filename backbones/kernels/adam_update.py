@@ -1,0 +1,286 @@
+"""Compiled Adam update with the gradients of local grid terms: memory is read and written once."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from backbones.kernels.adam_layout import Layout, Moments, Neighbours, Terms
+from backbones.kernels.compiler import float32, inline, integer, kernel, matrix, next_task, vector
+from backbones.kernels.simd import LANES, load, one, store, total, wide
+from backbones.kernels.simd_math import divide, flush, magnitude, sign, square_root
+from backbones.kernels.threading import launch
+
+__all__ = ["update"]
+
+# Elements worked on at a time: all that one piece reads and writes stays in the first-level cache.
+_PIECE = 1024
+# Blocks of slabs that may be updated at the same time; fixed, so that sums do not depend on threads.
+_BLOCKS = 24
+# Elements of a task where no term looks at neighbours.
+_FLAT = 1 << 15
+_ZERO, _ONE = np.float32(0), np.float32(1)
+
+
+@inline
+def _moments(p: Any, m: Any, v: Any, i: int, c: Any, gradient: Any, s: Any) -> None:
+    """Update the moments at ``i`` by the gradient and write the parameter that was ``c``."""
+    moment = load(m, i, c)
+    moment = flush(moment + s.rest1 * (gradient - moment))
+    square = flush(s.beta2 * load(v, i, c) + s.rest2 * (gradient * gradient))
+    store(m, i, moment)
+    store(v, i, square)
+    store(p, i, s.keep * c - s.rate * divide(moment, square_root(square) * s.root + s.eps))
+
+
+@inline
+def _flat_step(p: Any, g: Any, m: Any, v: Any, i: int, like: Any, s: Any, k: Any) -> tuple[Any, Any, Any]:
+    """One step of `_flat`; returns what it adds to the sums of ``|g|``, ``|p|`` and ``p^2``."""
+    c, slope = load(p, i, like), load(g, i, like)
+    _moments(p, m, v, i, c, slope + k.sign * sign(c) + k.value * c, s)
+    return magnitude(slope), magnitude(c), c * c
+
+
+@inline
+def _idle(g: Any, m: Any, v: Any, first: int, last: int) -> Any:
+    """Whether a step without local terms would leave all as it is."""
+    split = last - (last - first) % LANES
+    sizes = wide()
+    for i in range(first, split, LANES):
+        sizes = sizes + magnitude(load(g, i, wide())) + magnitude(load(m, i, wide())) + load(v, i, wide())
+    size = total(sizes)
+    for i in range(split, last):
+        size += abs(g[i]) + abs(m[i]) + v[i]
+    return size == _ZERO
+
+
+@inline
+def _constants(x: Any) -> Moments:
+    return Moments(x[0], x[1], x[2], x[3], x[4], x[5], x[6])
+
+
+@inline
+def _factors(x: Any) -> Terms:
+    return Terms(x[7], x[8], x[9], x[10], x[11])
+
+
+@kernel
+def _flat(table: Any) -> None:
+    """p, g, m, v, constants, sums ``(tasks, 5)``."""
+    p, g, m, v = (
+        vector(table, 0, float32),
+        vector(table, 1, float32),
+        vector(table, 2, float32),
+        vector(table, 3, float32),
+    )
+    numbers, sums = vector(table, 4, float32), matrix(table, 5, np.float64)
+    s, k = _constants(numbers), _factors(numbers)
+    skips = k.sign == _ZERO and k.value == _ZERO and s.keep == _ONE
+    while True:
+        task = next_task(table)
+        if task < 0:
+            break
+        end = min((task + 1) * _FLAT, p.shape[0])
+        for first in range(task * _FLAT, end, _PIECE):
+            last = min(first + _PIECE, end)
+            if skips and _idle(g, m, v, first, last):
+                continue
+            split = last - (last - first) % LANES
+            slopes, sizes, squares = wide(), wide(), wide()
+            for i in range(first, split, LANES):
+                slope, size, square = _flat_step(p, g, m, v, i, wide(), s, k)
+                slopes, sizes, squares = slopes + slope, sizes + size, squares + square
+            slope_sum, size_sum, square_sum = total(slopes), total(sizes), total(squares)
+            for i in range(split, last):
+                slope, size, square = _flat_step(p, g, m, v, i, one(), s, k)
+                slope_sum, size_sum, square_sum = slope_sum + slope, size_sum + size, square_sum + square
+            sums[task, 3] += size_sum
+            sums[task, 4] += square_sum
+            if slope_sum != _ZERO:
+                g[first:last] = _ZERO
+
+
+@inline
+def _grid_step(
+    p: Any,
+    g: Any,
+    m: Any,
+    v: Any,
+    kept: Any,
+    high: Any,
+    i: int,
+    to: int,
+    ahead: int,
+    n: Any,
+    like: Any,
+    s: Any,
+    k: Any,
+) -> tuple[Any, Any, Any, Any, Any, Any]:
+    """One step of `_grid`; returns what it adds to the sums of ``|g|`` and of the five terms.
+
+    A missing neighbour is the element itself, as its offset is 0: its difference is 0.
+    """
+    c, low, slope = load(p, i, like), load(kept, to, like), load(g, i, like)
+    # From here on `kept` holds the present slab, up to and with this step.
+    store(kept, to, c)
+    by_slab = load(high, ahead, like) - c
+    by_node = load(p, i + n.right, like) - c
+    gradient = slope + k.slabs * (c - low - by_slab) + k.nodes * (c - load(kept, to - n.left, like) - by_node)
+    by_row = load(p, i + n.down, like) - c
+    gradient = gradient + k.rows * (c - load(kept, to - n.up, like) - by_row)
+    gradient = gradient + k.sign * sign(c) + k.value * c
+    _moments(p, m, v, i, c, gradient, s)
+    return magnitude(slope), by_slab * by_slab, by_row * by_row, by_node * by_node, magnitude(c), c * c
+
+
+@inline
+def _grid_piece(
+    p: Any,
+    g: Any,
+    m: Any,
+    v: Any,
+    kept: Any,
+    high: Any,
+    at: int,
+    to: int,
+    ahead: int,
+    count: int,
+    n: Any,
+    s: Any,
+    k: Any,
+    sums: Any,
+) -> None:
+    """``count`` elements from ``at`` on that all have the same neighbours."""
+    for first in range(0, count, _PIECE):
+        last = min(first + _PIECE, count)
+        split = last - (last - first) % LANES
+        a0, a1, a2, a3, a4, a5 = wide(), wide(), wide(), wide(), wide(), wide()
+        for i in range(first, split, LANES):
+            b0, b1, b2, b3, b4, b5 = _grid_step(
+                p, g, m, v, kept, high, at + i, to + i, ahead + i, n, wide(), s, k
+            )
+            a0, a1, a2, a3, a4, a5 = a0 + b0, a1 + b1, a2 + b2, a3 + b3, a4 + b4, a5 + b5
+        c0, c1, c2, c3, c4, c5 = total(a0), total(a1), total(a2), total(a3), total(a4), total(a5)
+        for i in range(split, last):
+            d0, d1, d2, d3, d4, d5 = _grid_step(
+                p, g, m, v, kept, high, at + i, to + i, ahead + i, n, one(), s, k
+            )
+            c0, c1, c2, c3, c4, c5 = c0 + d0, c1 + d1, c2 + d2, c3 + d3, c4 + d4, c5 + d5
+        sums[0] += c1
+        sums[1] += c2
+        sums[2] += c3
+        sums[3] += c4
+        sums[4] += c5
+        if c0 != _ZERO:
+            g[at + first : at + last] = _ZERO
+
+
+@kernel
+def _grid(table: Any) -> None:
+    """As `_flat`, then the old slabs before and after each block, slabs, rows, nodes, inner, slabs of a
+    block.
+
+    A task is a block of slabs. Parameters are overwritten in place, so old values that neighbours still need
+    are kept, one slab of them; what lies in other blocks was copied beforehand.
+    """
+    p, g, m, v = (
+        vector(table, 0, float32),
+        vector(table, 1, float32),
+        vector(table, 2, float32),
+        vector(table, 3, float32),
+    )
+    numbers, sums = vector(table, 4, float32), matrix(table, 5, np.float64)
+    before, after = vector(table, 6, float32), vector(table, 7, float32)
+    slabs, rows, nodes, inner, block = (
+        integer(table, 8),
+        integer(table, 9),
+        integer(table, 10),
+        integer(table, 11),
+        integer(table, 12),
+    )
+    s, k = _constants(numbers), _factors(numbers)
+    length = nodes * inner
+    slab = rows * length
+    blocks = (slabs + block - 1) // block
+    kept = np.empty(slab, np.float32)
+    while True:
+        task = next_task(table)
+        if task < 0:
+            break
+        outer, number = task // blocks, task % blocks
+        first, last = number * block, min((number + 1) * block, slabs)
+        # Of inner boundaries only, so one slab less than there are blocks.
+        edge = (outer * (blocks - 1) + number) * slab
+        at = (outer * slabs + first) * slab
+        kept[:] = before[edge - slab : edge] if number > 0 else p[at : at + slab]
+        for a in range(first, last):
+            at = (outer * slabs + a) * slab
+            for r in range(rows):
+                to = r * length
+                i = at + to
+                high, ahead = p, i
+                if a + 1 < last:
+                    ahead = i + slab
+                elif a + 1 < slabs:
+                    high, ahead = after, edge + to
+                up, down = length if r > 0 else 0, length if r + 1 < rows else 0
+                # The first node has no left neighbour, the last one no right one.
+                for part in range(3):
+                    start = 0 if part == 0 else inner if part == 1 else length - inner
+                    stop = inner if part == 0 else length - inner if part == 1 else length
+                    if part == 2 and nodes == 1:
+                        continue
+                    n = Neighbours(
+                        0 if part == 0 else inner, 0 if part == 2 or nodes == 1 else inner, up, down
+                    )
+                    _grid_piece(
+                        p,
+                        g,
+                        m,
+                        v,
+                        kept,
+                        high,
+                        i + start,
+                        to + start,
+                        ahead + start,
+                        stop - start,
+                        n,
+                        s,
+                        k,
+                        sums[task],
+                    )
+
+
+def update(
+    p: Tensor, g: Tensor, m: Tensor, v: Tensor, moments: Moments, terms: Terms, shape: Layout
+) -> Tensor:
+    """One Adam step on ``p``, in place, with moments ``m`` and ``v``; adds the local gradients to ``g``, and
+    then clears it.
+
+    Args:
+        p, g, m, v: contiguous float32 CPU tensors of one size.
+        moments, terms: constants of the step.
+        shape: of the tensors, from `layout`.
+
+    Returns:
+        ``(5,)`` float64: of the parameters before the step, the sums of squared forward differences along
+        slabs, rows and nodes, of absolute values and of squares; 0 for those whose factor in ``terms`` is 0.
+    """
+    constants = torch.tensor([*moments, *terms], dtype=torch.float32)
+    tensors = [x.view(-1) for x in (p.detach(), g, m, v)]
+    if not (terms.slabs or terms.rows or terms.nodes):
+        tasks = -(-p.numel() // _FLAT)
+        sums = torch.zeros(tasks, 5, dtype=torch.float64)
+        launch(_flat, tasks, *tensors, constants, sums)
+        return sums.sum(0)
+    block = -(-shape.slabs // _BLOCKS)
+    blocks = -(-shape.slabs // block)
+    slabs = tensors[0].view(shape.outer, shape.slabs, -1)
+    before = slabs[:, block - 1 : (blocks - 1) * block : block].contiguous().view(-1)
+    after = slabs[:, block::block].contiguous().view(-1)
+    sums = torch.zeros(shape.outer * blocks, 5, dtype=torch.float64)
+    launch(_grid, len(sums), *tensors, constants, sums, before, after, *shape[1:], block)
+    return sums.sum(0)
