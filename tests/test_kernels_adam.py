@@ -14,7 +14,6 @@ from backbones.kernels import adam_update
 from backbones.kernels.adam import FusedAdam
 from backbones.kernels.adam_layout import Layout, layout
 from gridreg.base import LocalTerm
-from gridreg.errors import InputError
 from gridreg.rendering.backends import use_backend
 
 BETAS = (0.9, 0.99)
