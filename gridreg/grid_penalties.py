@@ -187,10 +187,11 @@ class L1(Regularizer):
 class Orthogonality(Regularizer):
     """Channels of the site's lines should not repeat each other: see `orthogonality`.
 
-    Lines are the grids with one spatial axis; planes and voxels at the same site are left alone.
+    Lines are the grids with one spatial axis. Planes and voxels beside them are left alone, as in TensoRF;
+    at a site without lines they are taken themselves, each channel as one long row.
 
     Args:
-        site: the lines among its `grids` are penalised.
+        site: the lines among its `grids` are penalised, or all of them if there are no lines.
         weight: factor of the loss; Few TensoRF: 0.01.
 
     Formula: ``sum over lines V (channels x nodes) of mean(abs(V V^T)) off the diagonal``
@@ -198,7 +199,7 @@ class Orthogonality(Regularizer):
     Source: TensoRF's program (`Ortho_weight`)
 
     Raises:
-        InputError: the site or the weight is not one; the site has no lines.
+        InputError: the site or the weight is not one; a grid has no spatial axes.
 
     Example:
         >>> Orthogonality("density").weight
@@ -216,10 +217,8 @@ class Orthogonality(Regularizer):
     def grid_penalty(self, grids: Sequence[Grid], context: Context) -> Tensor:
         """`orthogonality`, added over the lines."""
         lines = [grid for grid in grids if len(_spatial(grid, "Orthogonality")) == 1]
-        if not lines:
-            names = ", ".join(grid.name for grid in grids)
-            raise InputError(f"Orthogonality: expected grids with one spatial axis, found none among {names}")
-        return torch.stack([orthogonality(g.values.movedim(g.dim, 0).flatten(1)) for g in lines]).sum()
+        rows = [grid.values.movedim(grid.dim, 0).flatten(1) for grid in lines or grids]
+        return torch.stack([orthogonality(row) for row in rows]).sum()
 
     @classmethod
     def examples(cls, site: SiteLike) -> list[Regularizer]:

@@ -109,9 +109,11 @@ class TestOrthogonality:
         (gradient,) = torch.autograd.grad(orthogonality(single), single)
         assert (gradient == 0).all()
 
-    def test_a_site_without_lines_is_an_error(self) -> None:
-        with pytest.raises(InputError, match="expected grids with one spatial axis, found none among grid0"):
-            Orthogonality("density").grid_penalty([grid(2, 3, 4, dim=0, spatial=(1, 2))], CONTEXT)
+    def test_a_site_without_lines_takes_its_planes(self) -> None:
+        plane = grid(3, 4, 2, dim=2, spatial=(0, 1))
+        found = Orthogonality("density").grid_penalty([plane], CONTEXT)
+        rows = plane.parameter.numpy().reshape(12, 2).T
+        assert found.item() == pytest.approx(oracles.orthogonality(rows))
 
 
 @pytest.mark.parametrize("regularizer", [TotalVariation("density"), L1("density")])
