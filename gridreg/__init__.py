@@ -5,6 +5,7 @@ from gridreg.attach import open_channels, strip
 from gridreg.base import REGISTRY, Clock, Context, LocalTerm, Regularizer, overrides, register
 from gridreg.channel_masks import Mask
 from gridreg.compose import from_config, to_config
+from gridreg.compositions import composition, composition_names, register_composition
 from gridreg.dropout import ComponentDropout, component_dropout
 from gridreg.encodings import PositionalEncoding, octaves_of_channels, positional_encoding
 from gridreg.errors import InputError
@@ -101,6 +102,8 @@ __all__ = [
     "authors_frequency_mask",
     "cauchy_sparsity",
     "component_dropout",
+    "composition",
+    "composition_names",
     "cosine_mask",
     "depth_smoothness",
     "distortion",
@@ -128,6 +131,7 @@ __all__ = [
     "ray_kl",
     "register",
     "register_adapter",
+    "register_composition",
     "register_schedule",
     "resolve",
     "scale_gradients_by_distance",

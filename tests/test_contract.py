@@ -1,0 +1,189 @@
+"""The contract suite: every registered regularizer keeps every law on every foreign field."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+import gridreg
+from gridreg.base import REGISTRY, Clock, Context, Regularizer
+from gridreg.schedules import Numeric
+from gridreg.sites import Place, SiteLike
+from tests import laws
+from tests.fields import DESIGNS, made, points
+
+PLACES = st.integers(1, 24).flatmap(
+    lambda channels: st.one_of(
+        st.just(None), st.lists(st.integers(-1, 6), min_size=channels, max_size=channels)
+    ).map(lambda octaves: place_of(channels, octaves))
+)
+
+
+def place_of(channels: int, octaves: list[int] | None) -> Place:
+    place = Place("grid", gridreg.outputs("grid", octaves=octaves), -1, octaves=octaves and tuple(octaves))
+    place.complete(channels)
+    return place
+
+
+def mask_at(mask: gridreg.Mask, place: Place, step: int, total_steps: int) -> Tensor:
+    clock = Clock(total_steps, seed=0)
+    clock.step = step
+    return mask.mask(Context(clock, place))
+
+
+def check_mask(mask: gridreg.Mask, place: Place, step: int, total_steps: int) -> None:
+    """The laws of masks at one place, step and run length."""
+    values = mask_at(mask, place, step, total_steps)
+    assert values.dtype == torch.float32
+    assert values.shape == (place.channels,)
+    assert 0 <= values.min()
+    assert values.max() <= 1
+    ranks = torch.tensor(mask.ranks(place))
+    by_rank = [values[ranks == rank] for rank in range(int(ranks.max()) + 1)]
+    by_rank = [group for group in by_rank if len(group)]
+    assert all((group == group[0]).all() for group in by_rank)
+    if mask.monotone():
+        assert all(low[0] >= high[0] for low, high in zip(by_rank, by_rank[1:], strict=False))
+        assert (mask_at(mask, place, step + 1, total_steps) >= values).all()
+    end = mask.end(int(ranks.max()) + 1, total_steps)
+    if end is not None:
+        assert (mask_at(mask, place, end, total_steps) == 1).all()
+        assert (mask_at(mask, place, max(end, step), total_steps) == 1).all()
+        assert (mask_at(mask, place, 0, total_steps) == 1).any()
+
+
+def mask_classes() -> list[type[gridreg.Mask]]:
+    return [cls for cls in REGISTRY.values() if issubclass(cls, gridreg.Mask)]
+
+
+@given(PLACES, st.integers(0, 150), st.integers(1, 120), st.data())
+def test_masks(place: Place, step: int, total_steps: int, data: st.DataObject) -> None:
+    cls = data.draw(st.sampled_from(mask_classes()))
+    for example in cls.examples("grid"):
+        check_mask(example, place, step, total_steps)
+
+
+@pytest.mark.parametrize("name", DESIGNS)
+@pytest.mark.parametrize("cls", REGISTRY.values(), ids=REGISTRY.keys())
+def test_every_regularizer_on_every_design(cls: type[Regularizer], name: str) -> None:
+    checked = laws.check(cls, name)
+    # A penalty on lines has nothing to do on a field without lines; any other class fits every design.
+    assert checked > 0 or laws.READS_GRIDS[0] in vars(cls)
+
+
+@pytest.mark.parametrize("cls", REGISTRY.values(), ids=REGISTRY.keys())
+def test_every_regularizer_fits_several_designs(cls: type[Regularizer]) -> None:
+    first = {name: laws.examples_on(cls, design)[0] for name, design in DESIGNS.items()}
+    assert sum(laws.accepted(example, name) for name, example in first.items()) >= 2
+
+
+def test_all_parts_of_the_registry_are_met() -> None:
+    parts = {part for cls in REGISTRY.values() for part in dir(Regularizer) if gridreg.overrides(cls, part)}
+    assert {"transform", "penalty", "grid_penalty", "local_terms", "on_samples"} <= parts
+    assert {"background", "near_far", "parameter_groups", "update_groups"} <= parts
+
+
+@pytest.fixture
+def registered() -> Any:
+    """Register classes for one test."""
+    known = dict(REGISTRY)
+    yield gridreg.register
+    REGISTRY.clear()
+    REGISTRY.update(known)
+
+
+@dataclass(frozen=True)
+class Halving(gridreg.Mask):
+    """Opens the upper half of the ranks half-way."""
+
+    level: Numeric = 0.5
+
+    def rank_values(self, count: int, context: Context) -> Tensor:
+        low = 1.0 if context.step >= context.total_steps // 2 else context.at(self.level, "level", 0, 1)
+        return torch.where(torch.arange(count) < (count + 1) // 2, 1.0, low)
+
+    def end(self, count: int, total_steps: int) -> int:
+        return total_steps // 2
+
+    @classmethod
+    def examples(cls, site: SiteLike) -> list[Regularizer]:
+        return [cls(site), cls(site, detach=True)]
+
+
+@dataclass(frozen=True)
+class Reversed(Halving):
+    """Opens high channels first, which no mask may do."""
+
+    def rank_values(self, count: int, context: Context) -> Tensor:
+        return super().rank_values(count, context).flip(0)
+
+
+@dataclass(frozen=True)
+class Forgetful(gridreg.Regularizer):
+    """Adds a random number that it does not keep in its state."""
+
+    site: SiteLike
+
+    def transform(self, value: Tensor, context: Context) -> Tensor:
+        return value + torch.rand((), generator=context.generator)
+
+    @classmethod
+    def examples(cls, site: SiteLike) -> list[Regularizer]:
+        return [cls(site)]
+
+
+def test_a_new_regularizer_is_covered_by_being_registered(registered: Any) -> None:
+    registered(Halving)
+    assert Halving in mask_classes()
+    assert all(laws.check(REGISTRY["Halving"], name) > 0 for name in DESIGNS)
+    for place in (place_of(7, None), place_of(4, [-1, 0, 0, 1])):
+        check_mask(Halving("grid"), place, 3, 20)
+
+
+def test_the_suite_catches_what_breaks_a_law(registered: Any) -> None:
+    registered(Reversed)
+    with pytest.raises(AssertionError):
+        check_mask(Reversed("grid"), place_of(8, None), 0, 20)
+    registered(Forgetful)
+    with pytest.raises(AssertionError, match="breaks"):
+        laws.check(Forgetful, "tensorf")
+
+
+@pytest.mark.parametrize("name", DESIGNS)
+@given(data=st.data())
+def test_two_masks_on_one_site_multiply(name: str, data: st.DataObject) -> None:
+    site = data.draw(st.sampled_from(DESIGNS[name].mask_sites))
+    masks = [
+        example for cls in mask_classes() for example in cls.examples(site) if not example.gradient_only()
+    ]
+    pair = [data.draw(st.sampled_from(masks)) for _ in range(2)]
+    step = data.draw(st.integers(0, 25))
+    field = made(name)
+    with gridreg.apply(field, *pair, total_steps=20) as handle:
+        field(*points(2))
+        handle.step(step)
+        stacked = field(*points())
+    contexts = [next(laws.contexts(mask, name, step)) for mask in pair]
+    first, second = (mask.mask(context) for mask, context in zip(pair, contexts, strict=True))
+    with gridreg.apply(field, Product(site, tuple((first * second).tolist())), total_steps=20):
+        expected = field(*points())
+    assert all(torch.allclose(a, b, atol=1e-6) for a, b in zip(stacked, expected, strict=True))
+
+
+@dataclass(frozen=True)
+class Product(gridreg.Mask):
+    """Given factors, channel by channel."""
+
+    factors: tuple[float, ...] = ()
+
+    def ranks(self, place: Place) -> tuple[int, ...]:
+        return tuple(range(place.channels or 0))
+
+    def rank_values(self, count: int, context: Context) -> Tensor:
+        return torch.tensor(self.factors)
