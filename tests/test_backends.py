@@ -248,7 +248,8 @@ class TestChoice:
             return plain.composite_weights(tau, offsets)
 
         tau, offsets = random_packed(2, [2, 3])
-        assert not takes_compiled(tau.float())
+        composite_weights(tau.float(), offsets)
+        assert calls == []
         register_backend("compiled", Backend(plain.march, compiled, plain.accumulate, plain.terminate))
         for choice in ("auto", "compiled", "torch"):
             with use_backend(choice):
@@ -256,5 +257,7 @@ class TestChoice:
                 composite_weights(tau, offsets)
         assert calls == [torch.float32] * 2
         assert takes_compiled(tau.float())
+        with use_backend("torch"):
+            assert not takes_compiled(tau.float())
         assert not takes_compiled(tau.float(), tau)
         assert not takes_compiled(tau.float().to("meta"))

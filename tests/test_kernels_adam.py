@@ -9,8 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import backbones.kernels  # noqa: F401  (registers the compiled path)
-from backbones.kernels import adam_update
+from backbones.kernels import adam, adam_update
 from backbones.kernels.adam import FusedAdam
 from backbones.kernels.adam_layout import Layout, layout
 from gridreg.base import LocalTerm
@@ -227,6 +226,23 @@ class TestExactness:
             assert not torch.isfinite(p.detach()[20, 1, 3])
             assert torch.isfinite(p.detach()).sum() == p.numel() - 1
             assert torch.count_nonzero(p.grad) == 0
+
+
+def test_which_tensors_take_the_kernel(monkeypatch):
+    calls = []
+
+    def record(p, *rest):
+        calls.append(p.dtype)
+        return adam_update.update(p, *rest)
+
+    monkeypatch.setattr(adam, "update", record)
+    strided = torch.nn.Parameter(torch.zeros(3, 2).T)
+    for p in (grid((2, 3), 0), grid((2, 3), 0, torch.float64), strided):
+        p.grad = torch.ones_like(p)
+        FusedAdam([p], lr=0.1).step()
+        with use_backend("torch"):
+            FusedAdam([p], lr=0.1).step()
+    assert calls == [torch.float32]
 
 
 def test_layout():

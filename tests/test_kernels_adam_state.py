@@ -8,7 +8,6 @@ import math
 import pytest
 import torch
 
-import backbones.kernels  # noqa: F401  (registers the compiled path)
 from backbones.kernels.adam import FusedAdam
 from gridreg.base import LocalTerm
 from gridreg.errors import InputError

@@ -279,8 +279,11 @@ def update(
     block = -(-shape.slabs // _BLOCKS)
     blocks = -(-shape.slabs // block)
     slabs = tensors[0].view(shape.outer, shape.slabs, -1)
-    before = slabs[:, block - 1 : (blocks - 1) * block : block].contiguous().view(-1)
-    after = slabs[:, block::block].contiguous().view(-1)
+    # Copies, also where a slice is contiguous as it is.
+    before, after = (
+        x.clone(memory_format=torch.contiguous_format).view(-1)
+        for x in (slabs[:, block - 1 : (blocks - 1) * block : block], slabs[:, block::block])
+    )
     sums = torch.zeros(shape.outer * blocks, 5, dtype=torch.float64)
     launch(_grid, len(sums), *tensors, constants, sums, before, after, *shape[1:], block)
     return sums.sum(0)

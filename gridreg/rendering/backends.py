@@ -113,14 +113,12 @@ class use_backend:
 
 
 def takes_compiled(*tensors: Tensor) -> bool:
-    """Whether the current choice sends these tensors to compiled code: all on the CPU, all float32."""
-    if _choice == "torch" or "compiled" not in _BACKENDS:
-        return False
-    return all(x.device.type == "cpu" and x.dtype == torch.float32 for x in tensors)
+    """Whether the choice allows compiled code for these tensors: all on the CPU, all float32."""
+    return _choice != "torch" and all(x.device.type == "cpu" and x.dtype == torch.float32 for x in tensors)
 
 
 def _backend(*tensors: Tensor) -> Backend:
-    return _BACKENDS["compiled"] if takes_compiled(*tensors) else _TORCH
+    return _BACKENDS.get("compiled", _TORCH) if takes_compiled(*tensors) else _TORCH
 
 
 def march(
