@@ -152,6 +152,13 @@ def test_image_and_mean_metrics():
         assert mean[name] == pytest.approx(np.mean([r[name] for r in rows]), abs=1e-12)
 
 
+def test_further_metrics_stand_under_their_names():
+    a, b = map(torch.from_numpy, image_pair(1))
+    got = metrics.image_metrics(a, b, {"largest": lambda x, y: float((x - y).abs().max())})
+    assert list(got) == ["psnr", "ssim_gaussian", "ssim_uniform", "largest"]
+    assert got["largest"] == float((a - b).abs().max())
+
+
 def test_numbers_for_json():
     values = [25.0, math.inf, -math.inf, 1e-300]
     text = json.dumps([metrics.json_number(v) for v in values], allow_nan=False)

@@ -17,7 +17,7 @@ hundredths:
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Literal, get_args
 
 import torch
@@ -128,8 +128,15 @@ def ssim(image: Tensor, target: Tensor, convention: SsimConvention = "gaussian")
     return float((luminance * structure).mean())
 
 
-def image_metrics(image: Tensor, target: Tensor) -> dict[str, float]:
-    """The metrics of one image by name: ``psnr`` (dB), ``ssim_gaussian``, ``ssim_uniform``.
+def image_metrics(
+    image: Tensor, target: Tensor, more: Mapping[str, Callable[[Tensor, Tensor], float]] | None = None
+) -> dict[str, float]:
+    """The metrics of one image by name: ``psnr`` (dB), ``ssim_gaussian``, ``ssim_uniform``, and ``more``.
+
+    Args:
+        image: ``(H, W, C)`` in [0, 1].
+        target: the same shape.
+        more: further metrics by name, such as ``{lpips.name: lpips}`` of `gridreg.training.perceptual`.
 
     Raises:
         InputError: as ``psnr`` and ``ssim``.
@@ -138,6 +145,7 @@ def image_metrics(image: Tensor, target: Tensor) -> dict[str, float]:
         "psnr": psnr(image, target),
         "ssim_gaussian": ssim(image, target, "gaussian"),
         "ssim_uniform": ssim(image, target, "uniform"),
+        **{name: metric(image, target) for name, metric in (more or {}).items()},
     }
 
 
