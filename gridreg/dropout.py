@@ -52,6 +52,8 @@ class ComponentDropout(Regularizer):
         site: where it acts.
         p: probability to drop a channel, in [0, 0.999].
 
+    Formula: each channel times ``0`` with probability p, else ``1 / (1 - p)``
+    Unit: none
     Source: none for grids; DropGaussian (Park et al., CVPR 2025) does it to Gaussians with p = 0.2 t / T.
 
     >>> ComponentDropout("density").p

@@ -56,7 +56,7 @@ def scale_gradients_by_distance(samples: RaySamples, distance: float = 1.0) -> R
         distance: from the camera, world units, from which on gradients count in full.
 
     Returns:
-        The samples, with the same values. Source: Floaters No More (Philip and Deschaintre 2023), equation 5.
+        The samples, with the same values. Source: Floaters No More (Philip and Deschaintre 2023).
 
     Raises:
         InputError: the distance is not above 0.
@@ -91,7 +91,7 @@ class DistanceGradientScaling(Regularizer):
 
     Formula: gradients of density and colour times ``clamp((t / distance)^2, 0, 1)``
     Unit: none
-    Source: Floaters No More (Philip and Deschaintre 2023), equation 5
+    Source: Floaters No More (Philip and Deschaintre 2023)
 
     Raises:
         InputError: the distance is not above 0.

@@ -26,8 +26,8 @@ def total_variation(values: Tensor, axes: Sequence[int]) -> Tensor:
         axes: its spatial axes.
 
     Returns:
-        Scalar, squared unit of the values. Source: TensoRF (Chen et al. 2022), section 4.3; its program's
-        `TVLoss` is twice this, for each plane.
+        Scalar, squared unit of the values. Source: TensoRF (Chen et al. 2022), total variation loss; its
+        program's `TVLoss` is twice this, for each plane.
 
     Example:
         >>> total_variation(torch.tensor([[0.0, 1.0], [0.0, 1.0]]), axes=(0, 1)).item()
@@ -47,7 +47,7 @@ def l1(values: Tensor) -> Tensor:
         values: any shape.
 
     Returns:
-        Scalar. Source: TensoRF (Chen et al. 2022), equation 17.
+        Scalar, unit of the values. Source: TensoRF (Chen et al. 2022), sparsity loss.
 
     Example:
         >>> l1(torch.tensor([-1.0, 3.0])).item()
@@ -102,7 +102,7 @@ class TotalVariation(Regularizer):
 
     Formula: ``sum over grids and spatial axes of mean((g[i + 1] - g[i])^2)``
     Unit: squared unit of the grid
-    Source: TensoRF (Chen et al. 2022), section 4.3
+    Source: TensoRF (Chen et al. 2022), total variation loss
 
     Raises:
         InputError: the site or the weight is not one; a grid has no spatial axes.
@@ -147,7 +147,7 @@ class L1(Regularizer):
 
     Formula: ``sum over grids of mean(abs(g))``
     Unit: unit of the grid
-    Source: TensoRF (Chen et al. 2022), equation 17
+    Source: TensoRF (Chen et al. 2022), sparsity loss
 
     Raises:
         InputError: the site or the weight is not one.

@@ -33,6 +33,8 @@ class LevelMask(Mask):
         features: channels per level.
         detach: closed channels keep their values and only lose their gradient.
 
+    Formula: level l open if ``l < start + int((t - begin) / every)``
+    Unit: none
     Source: Neuralangelo (Li et al., CVPR 2023), section 3.2: 4 levels, one more every 5,000 of 500,000 steps.
 
     >>> LevelMask("hash", start=4, every=5000).features
@@ -103,6 +105,8 @@ class ViewDependenceMask(Mask):
             colour's.
         detach: closed channels keep their values and only lose their gradient.
 
+    Formula: spherical bands ``>= bands`` 0
+    Unit: none
     Source: SANeRF drops bands from 2 on.
 
     >>> ViewDependenceMask("encoding.direction", bands=0).bands

@@ -31,6 +31,9 @@ class FrequencyMask(Mask):
             (`gridreg.printed_frequency_mask`) and "authors" (`gridreg.authors_frequency_mask`).
         detach: closed channels keep their values and only lose their gradient.
 
+    Formula: ``p = min(L/B t/T + 1, L/B)``; channels below ``B int(p)`` 1, the next B ``p - int(p)``, the rest
+    0
+    Unit: none
     Source: FreeNeRF (Yang et al., CVPR 2023), section 3.3; on components of a grid: Few TensoRF.
 
     >>> FrequencyMask("density", until=0.9)
@@ -105,6 +108,8 @@ class FixedMask(Mask):
         visible_ratio: open share, in [0, 1]: the first `int(channels * visible_ratio)`.
         detach: closed channels keep their values and only lose their gradient.
 
+    Formula: the first ``int(L visible_ratio)`` channels 1, the rest 0
+    Unit: none
     Source: Few TensoRF, human-body runs with 0.8.
 
     >>> FixedMask("appearance", visible_ratio=0.8).visible_ratio
@@ -145,6 +150,8 @@ class CosineMask(Mask):
         until: fraction of the run (float) or step (int) from which all is open.
         detach: closed channels keep their values and only lose their gradient.
 
+    Formula: ``(1 - cos(pi clamp(L t/T - k, 0, 1))) / 2`` for octave k
+    Unit: none
     Source: BARF (Lin et al., ICCV 2021), equation 14; Nerfies (Park et al., ICCV 2021), equation 8.
 
     >>> CosineMask("encoding.position", until=0.5).until

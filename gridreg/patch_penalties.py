@@ -33,12 +33,12 @@ def depth_smoothness(samples: RaySamples) -> Tensor:
     ``mean_ij (d_ij - d_{i+1,j})^2 + (d_ij - d_{i,j+1})^2`` over ``i < height``, ``j < width`` and patches.
 
     Args:
-        samples: rays of which the last are patches (`RaySamples.patch`), usually from unseen poses; the depth
-            is the sum of weight times distance.
+        samples: rays of which the last are patches (`RaySamples.patch`), usually from unseen poses; the
+            depth is the sum of weight times distance.
 
     Returns:
-        Scalar, squared world units. Source: RegNeRF (Niemeyer et al. 2022), equation 5, averaged as in its
-        program.
+        Scalar, squared world units. Source: RegNeRF (Niemeyer et al. 2022), geometry regularization,
+        averaged as in its program.
 
     Raises:
         InputError: the samples have no patches, or none of at least 2x2 rays.
@@ -66,8 +66,8 @@ def ray_kl(samples: RaySamples) -> Tensor:
         samples: rays of which the last are patches (`RaySamples.patch`).
 
     Returns:
-        Scalar in nats. Source: InfoNeRF (Kim et al. 2022), equation 9; its program has ray and neighbour
-        exchanged.
+        Scalar in nats. Source: InfoNeRF (Kim et al. 2022), information gain reduction; its program has ray
+        and neighbour exchanged.
 
     Raises:
         InputError: the samples have no patches, or none of at least 1x2 rays.
@@ -96,7 +96,7 @@ class DepthSmoothness(Regularizer):
 
     Formula: ``mean((d_ij - d_{i+1,j})^2 + (d_ij - d_{i,j+1})^2)`` over patches
     Unit: squared world units
-    Source: RegNeRF (Niemeyer et al. 2022), equation 5
+    Source: RegNeRF (Niemeyer et al. 2022), geometry regularization
 
     Example:
         >>> DepthSmoothness().weight.at(512, 15_000)
@@ -133,7 +133,7 @@ class RayKL(Regularizer):
 
     Formula: ``mean(sum_i p_i log(p_i / q_i))`` over rays and their right neighbours
     Unit: nats
-    Source: InfoNeRF (Kim et al. 2022), equation 9
+    Source: InfoNeRF (Kim et al. 2022), information gain reduction
 
     Example:
         >>> RayKL().weight

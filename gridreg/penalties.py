@@ -33,7 +33,8 @@ def occlusion_loss(
 
     The sum is divided by the number of all steps of all rays, as FreeNeRF's mean over a full rectangle of
     samples is; steps that the march skipped count as density 0. So the value does not depend on what was
-    skipped, and a ray that misses the box adds nothing. It does depend on the share of the ray that the mask
+    skipped, and a ray that misses the box adds nothing. It does depend on the share of the ray that the
+    mask
     covers: with half the step length, `count` covers half the distance, while `distance` means the same.
 
     Args:
@@ -43,11 +44,12 @@ def occlusion_loss(
         on: ``"density"`` (per world unit) or ``"weights"`` (which what lies in front can hide).
         colour_prior: number of steps; None: no prior. A colour of exactly 0 was not evaluated, and does not
             count as black.
-        near: distance along the ray where `distance` begins, world units; None: the ray's entry into the box.
+        near: distance along the ray where `distance` begins, world units; None: the ray's entry into the
+            box.
 
     Returns:
-        Scalar, per world unit (on density) or without unit (on weights). Source: FreeNeRF (Yang et al. 2023),
-        equation 7, and its program for the prior.
+        Scalar, per world unit (on density) or without unit (on weights). Source: FreeNeRF (Yang et al.
+        2023), occlusion regularization, and its program for the prior.
 
     Raises:
         InputError: both count and distance are given, `on` is unknown, or the prior finds no colours.
@@ -106,11 +108,12 @@ class OcclusionLoss(Regularizer):
         on: "density" or "weights".
         colour_prior: number of steps in which nearly white and nearly black samples count too; None: no
             prior. FreeNeRF: 20 on DTU.
-        near: distance along the ray where `distance` begins, world units; None: the ray's entry into the box.
+        near: distance along the ray where `distance` begins, world units; None: the ray's entry into the
+            box.
 
     Formula: ``mean(density * [step < samples])`` over all steps of all rays
     Unit: per world unit (on weights: none)
-    Source: FreeNeRF (Yang et al. 2023), equation 7
+    Source: FreeNeRF (Yang et al. 2023), occlusion regularization
 
     Raises:
         InputError: a number is out of range, both samples and distance are given, or `on` is unknown.
@@ -175,7 +178,7 @@ class CauchySparsity(Regularizer):
 
     Formula: ``sum log(1 + 2 density^2)`` over the samples
     Unit: none (density per world unit)
-    Source: Plenoxels (Yu et al. 2022), equation 4
+    Source: SNeRG (Hedman et al. 2021); on grids Plenoxels (Yu et al. 2022)
 
     Example:
         >>> CauchySparsity().weight

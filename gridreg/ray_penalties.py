@@ -65,7 +65,8 @@ def ray_entropy(samples: RaySamples, threshold: float = 0.1) -> Tensor:
 
     Returns:
         Scalar in nats; InfoNeRF's program takes log base 2, which is 1.4427 times as much. Source: InfoNeRF
-        (Kim et al. 2022), equations 5 to 8, with the opacity as its program has it in place of ``sum alpha``.
+        (Kim et al. 2022), ray entropy minimization, with the opacity in place of ``sum alpha`` as in its
+        program.
 
     Example:
         >>> two = RaySamples.from_dense(torch.tensor([[1.0, 2.0]]), torch.ones(1, 2), torch.ones(1, 2))
@@ -164,7 +165,7 @@ class RayEntropy(Regularizer):
 
     Formula: ``mean(-sum p log p)`` over rays with opacity > threshold, ``p = alpha / sum alpha``
     Unit: nats
-    Source: InfoNeRF (Kim et al. 2022), equations 5 to 8
+    Source: InfoNeRF (Kim et al. 2022), ray entropy minimization
 
     Raises:
         InputError: the weight or the threshold is out of range.

@@ -65,7 +65,7 @@ def anneal_space(
 
     Returns:
         The new near and far; at the end the tensors themselves. Source: RegNeRF (Niemeyer et al. 2022),
-        equations 10 and 11.
+        sample space annealing.
 
     Example:
         >>> near, far = anneal_space(torch.tensor([2.0]), torch.tensor([6.0]), progress=0.0)
@@ -143,7 +143,7 @@ class SpaceAnnealing(Regularizer):
 
     Formula: ``[m + (near - m) eta, m + (far - m) eta]``, ``eta = clamp(t / T, start, 1)``
     Unit: world units
-    Source: RegNeRF (Niemeyer et al. 2022), equations 10 and 11
+    Source: RegNeRF (Niemeyer et al. 2022), sample space annealing
 
     Raises:
         InputError: a number is out of range.

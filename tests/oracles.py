@@ -75,7 +75,7 @@ batches = st.builds(
 
 
 def occlusion(batch: Batch, mask: NDArray[np.bool_], on: str = "density") -> float:
-    """FreeNeRF equation 7: the mean over the whole rectangle of value times mask."""
+    """FreeNeRF: the mean over the whole rectangle of value times mask."""
     values = batch.density if on == "density" else batch.weights
     return float(np.mean(values * mask * batch.valid)) if values.size else 0.0
 
@@ -87,7 +87,7 @@ def opacity_entropy(batch: Batch) -> float:
 
 
 def ray_entropy(batch: Batch, threshold: float) -> float:
-    """InfoNeRF equations 5 to 8."""
+    """InfoNeRF: entropy of the normalised opacities of rays that hit something."""
     result = []
     for alpha, opacity in zip(batch.alpha, batch.weights.sum(1), strict=True):
         share = alpha / (alpha.sum() + 1e-10)
@@ -106,7 +106,7 @@ def distortion(batch: Batch, near: float = 0.0, far: float = 1.0) -> float:
 
 
 def depth_smoothness(depth: Array) -> float:
-    """RegNeRF equation 5 on depth maps (count, height, width), averaged over its sum's terms."""
+    """RegNeRF's geometry regularization on depth maps (count, height, width)."""
     count, height, width = depth.shape
     total = 0.0
     for n in range(count):
@@ -118,7 +118,7 @@ def depth_smoothness(depth: Array) -> float:
 
 
 def ray_kl(alpha: Array) -> float:
-    """InfoNeRF equation 9 on opacities (count, height, width, steps): each ray and the one to its right."""
+    """InfoNeRF's divergence of opacities (count, height, width, steps): each ray and the one to its right."""
     share = alpha / (alpha.sum(-1, keepdims=True) + 1e-10) + 1e-10
     p, q = share[:, :, :-1], share[:, :, 1:]
     return float(np.mean((p * np.log(p / q)).sum(-1)))

@@ -1,0 +1,138 @@
+"""Write docs/catalogue.md, the table of all regularizers, from the registry and the docstrings.
+
+python docs/make_catalogue.py            write the page
+python docs/make_catalogue.py --check    exit with status 1 if the page is stale
+"""
+
+from __future__ import annotations
+
+import argparse
+import inspect
+import re
+import sys
+from collections.abc import Sequence
+from dataclasses import MISSING, fields
+from pathlib import Path
+from typing import Any
+
+import gridreg
+from gridreg.base import REGISTRY, Regularizer, overrides
+from gridreg.schedules import Schedule
+
+PAGE = Path(__file__).with_name("catalogue.md")
+
+KINDS = {
+    "F": "features: multiplies channels, or scales their gradients",
+    "P": "parameters: the field sees its grids filtered",
+    "L": "loss: a penalty on samples or grids, times `weight`",
+    "S": "sampling: which part of the rays is sampled",
+    "D": "data: what the rays are compared with",
+    "O": "optimizer: options of the site's parameter groups",
+}
+
+HEAD = """# Catalogue
+
+Every regularizer that `gridreg` registers, with its formula, defaults, unit and source. Defaults are those of
+the class, in the order of its arguments; `site` has none. A number may be a schedule or a function of the
+step.
+Behind each class is a plain function, which its documentation names.
+
+Written by `python docs/make_catalogue.py` from the docstrings; edit those.
+
+"""
+
+
+def kind_of(cls: type[Regularizer]) -> str:
+    """Letter of `KINDS`, from the parts that a class plays."""
+    if overrides(cls, "transform"):
+        return "F" if cls.acts_on == "mask" else "P"
+    parts = {
+        "L": ("penalty", "grid_penalty"),
+        "S": ("near_far",),
+        "D": ("background",),
+        "O": ("parameter_groups", "update_groups"),
+        "F": ("on_samples",),
+    }
+    return next(kind for kind, methods in parts.items() if any(overrides(cls, m) for m in methods))
+
+
+def entry_of(cls: type[Regularizer], name: str) -> str:
+    """The paragraph "Name: ..." of a class's docstring.
+
+    Raises:
+        SystemExit: the docstring has none.
+    """
+    found = re.search(rf"^{name}: (.+?)(?=\n\n|\n[A-Z]\w+: |\Z)", inspect.getdoc(cls) or "", re.S | re.M)
+    if found is None:
+        raise SystemExit(f"{cls.__name__}: its docstring has no line '{name}: ...'")
+    return " ".join(found[1].split()).rstrip(".")
+
+
+def summary_of(cls: type[Regularizer]) -> str:
+    """First sentence of the docstring, without the pointer to a function."""
+    first = (inspect.getdoc(cls) or "").split("\n\n")[0]
+    return re.sub(r": see `\w+`(?: and `\w+`)?\.$", ".", " ".join(first.split()))
+
+
+def short(value: Any) -> str:
+    """A default as text; of a schedule the arguments that differ from its own defaults."""
+    if not isinstance(value, Schedule):
+        return repr(value)
+    shown = [
+        f"{f.name}={short(getattr(value, f.name))}"
+        for f in fields(value)
+        if f.default is MISSING or getattr(value, f.name) != f.default
+    ]
+    return f"{type(value).__name__}({', '.join(shown)})"
+
+
+def defaults_of(cls: type[Regularizer]) -> str:
+    """Arguments with their defaults."""
+    shown = [f"{f.name}={short(f.default)}" for f in fields(cls) if f.default is not MISSING]
+    return ", ".join(f"`{argument}`" for argument in shown) or "none"
+
+
+def row_of(cls: type[Regularizer]) -> str:
+    """Row of the table."""
+    cells = [
+        f"`{cls.__name__}`",
+        kind_of(cls),
+        summary_of(cls),
+        entry_of(cls, "Formula"),
+        defaults_of(cls),
+        entry_of(cls, "Unit"),
+        entry_of(cls, "Source"),
+    ]
+    return "| " + " | ".join(cell.replace("|", "\\|").replace("``", "`") for cell in cells) + " |"
+
+
+def page() -> str:
+    """The whole page."""
+    package = f"{gridreg.__name__}."
+    classes = [cls for cls in REGISTRY.values() if cls.__module__.startswith(package)]
+    classes.sort(key=lambda cls: (list(KINDS).index(kind_of(cls)), cls.__name__))
+    kinds = "\n".join(f"* **{letter}** {meaning}" for letter, meaning in KINDS.items())
+    titles = ("regularizer", "kind", "what it does", "formula", "defaults", "unit", "source")
+    head = f"| {' | '.join(titles)} |\n|{'---|' * len(titles)}\n"
+    return f"{HEAD}{kinds}\n\n{head}" + "\n".join(map(row_of, classes)) + "\n"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Write or check the page; the exit status."""
+    parser = argparse.ArgumentParser(description="Write docs/catalogue.md from the docstrings.")
+    parser.add_argument("--check", action="store_true", help="only say whether the page is stale")
+    check = parser.parse_args(arguments).check
+    text = page()
+    stale = not PAGE.is_file() or PAGE.read_text(encoding="utf-8") != text
+    if check:
+        print(f"{PAGE.name} is {'stale: run python docs/make_catalogue.py' if stale else 'up to date'}")
+        return int(stale)
+    if stale:
+        beside = PAGE.with_suffix(".tmp")
+        beside.write_text(text, encoding="utf-8")
+        beside.replace(PAGE)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
