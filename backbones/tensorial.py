@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from contextlib import AbstractContextManager
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from backbones import kernels
 from backbones.decoders import make_decoder
+from backbones.kernels.adam import FusedAdam
 from gridreg.sites import Site
 
 __all__ = ["TensorialField", "density_shift_for"]
@@ -161,6 +164,19 @@ class TensorialField(nn.Module):
             {"name": "grid", "params": self.grid_parameters()},
             {"name": "network", "params": self.network_parameters()},
         ]
+
+    def make_optimizer(self, groups: list[dict[str, Any]], betas: tuple[float, float]) -> torch.optim.Optimizer:
+        """Adam that folds grid penalties into its one pass over memory.
+
+        Args:
+            groups: as of `parameter_groups`, with learning rates.
+            betas: decay rates of the moments.
+        """
+        return FusedAdam(groups, betas=betas)
+
+    def gradient_context(self) -> AbstractContextManager[None]:
+        """Around a trainer's backward pass: gradients of planes are added to buffers that stay."""
+        return kernels.accumulate_into_grad()
 
     def sites(self) -> dict[str, Site]:
         """The encodings of the decoder; subclasses add their grids."""

@@ -10,7 +10,8 @@ from torch.nn import functional as F
 
 from backbones import kernels
 from backbones.tensorial import TensorialField
-from gridreg.sites import Site, open_channels, parameters
+from gridreg.attach import open_channels
+from gridreg.sites import Site, parameters
 
 __all__ = ["LINE_AXES", "PLANE_AXES", "VMField"]
 

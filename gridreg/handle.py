@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
-from weakref import WeakKeyDictionary
+from weakref import WeakKeyDictionary, ref
 
 import torch
 from torch import Tensor, nn
@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Handle"]
 
-_HANDLES: WeakKeyDictionary[nn.Module, list[Handle]] = WeakKeyDictionary()
+# Weak both ways: a handle holds its field, so a strong handle here would keep the field alive for ever.
+_HANDLES: WeakKeyDictionary[nn.Module, list[ref[Handle]]] = WeakKeyDictionary()
 
 
 class Handle:
@@ -36,7 +37,7 @@ class Handle:
         self.terms: dict[str, Tensor] = {}
         self._attachment = attachment
         self._removed = False
-        _HANDLES.setdefault(attachment.field, []).append(self)
+        _HANDLES.setdefault(attachment.field, []).append(ref(self))
 
     @property
     def regularizers(self) -> tuple[Regularizer, ...]:
@@ -167,7 +168,7 @@ class Handle:
         Parameters, lists and submodules may be replaced; on leaving, everything is attached again, by name.
         """
         self._require_applied()
-        handles = list(_HANDLES[self._attachment.field])
+        handles = [handle for reference in _HANDLES[self._attachment.field] if (handle := reference())]
         for handle in handles:
             handle._attachment.suspend()
         try:
@@ -186,7 +187,7 @@ class Handle:
         self._require_applied()
         self._attachment.detach()
         self._removed = True
-        _HANDLES[self._attachment.field].remove(self)
+        _HANDLES[self._attachment.field].remove(ref(self))
 
     def __enter__(self) -> Handle:
         self._require_applied()
@@ -235,6 +236,16 @@ class Handle:
     def values(self) -> dict[str, float]:
         """One number per regularizer for curves: the open share of a mask, the weight of a penalty."""
         return {row.name: row.value() for row in self._rows()}
+
+    def masks(self) -> dict[str, Tensor]:
+        """The masks of this step by regularizer name, each ``(channels,)``, for curves; a copy."""
+        found = {}
+        for row in self._rows():
+            for _, slot in row.slots:
+                if "mask" in slot.context.state:
+                    found[row.name] = slot.context.state["mask"].clone()
+                    break
+        return found
 
     def __repr__(self) -> str:
         """A table: regularizer, site, channels, value now."""

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from backbones.kernels import composite
 from backbones.kernels.autograd import accumulate_into_grad
 from backbones.kernels.dispatch import cp_density, cp_features, vm_density, vm_features
 
 __all__ = ["accumulate_into_grad", "cp_density", "cp_features", "vm_density", "vm_features"]
+
+composite.register()

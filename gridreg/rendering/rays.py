@@ -74,13 +74,15 @@ def camera_rays(pose: Tensor, intrinsics: Tensor, height: int, width: int) -> Ra
     return pixel_rays(pose, intrinsics, rows.reshape(-1), columns.reshape(-1))
 
 
-def box_intersection(rays: Rays, bounds: Tensor, near: float = 0.0, far: float = 1e10) -> tuple[Tensor, Tensor]:
+def box_intersection(
+    rays: Rays, bounds: Tensor, near: float | Tensor = 0.0, far: float | Tensor = 1e10
+) -> tuple[Tensor, Tensor]:
     """Where rays enter and leave an axis-aligned box (slab method, Kay and Kajiya 1986).
 
     Args:
         rays: ``R`` rays.
         bounds: ``(2, 3)`` lower and upper corner, world units.
-        near, far: the interval is clipped to these distances, world units.
+        near, far: the interval is clipped to these distances, world units; numbers or ``(R,)``.
 
     Returns:
         ``t_min``, ``t_max``, both ``(R,)``. A ray that misses has ``t_max == t_min``.
@@ -89,6 +91,7 @@ def box_intersection(rays: Rays, bounds: Tensor, near: float = 0.0, far: float =
     safe = torch.where(rays.directions.abs() < tiny, torch.full_like(rays.directions, tiny), rays.directions)
     at_lower = (bounds[0] - rays.origins) / safe
     at_upper = (bounds[1] - rays.origins) / safe
-    enter = torch.minimum(at_lower, at_upper).amax(dim=-1).clamp(min=near, max=far)
-    leave = torch.maximum(at_lower, at_upper).amin(dim=-1).clamp(min=near, max=far)
+    near_t, far_t = torch.as_tensor(near).to(bounds), torch.as_tensor(far).to(bounds)
+    enter = torch.minimum(at_lower, at_upper).amax(dim=-1).clamp(min=near_t, max=far_t)
+    leave = torch.maximum(at_lower, at_upper).amin(dim=-1).clamp(min=near_t, max=far_t)
     return enter, torch.maximum(enter, leave)

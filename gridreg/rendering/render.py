@@ -118,6 +118,7 @@ def render_rays(
     *,
     background: Tensor,
     jitter: Tensor | None = None,
+    near_far: tuple[Tensor, Tensor] | None = None,
     hook: SampleHook | None = None,
 ) -> Rendered:
     """Render a batch of rays, differentiably in the field's parameters.
@@ -129,11 +130,13 @@ def render_rays(
         march: step and bounds.
         background: colour behind the field, ``(3,)`` or ``(R, 3)``.
         jitter: ``(R,)`` in [0, 1), the share of a step by which each ray's samples are shifted; None: 0.5.
+        near_far: ``(R,)`` each, instead of the march's near and far.
         hook: gets the samples before they are composited.
     """
     if jitter is None:
         jitter = torch.full((len(rays),), 0.5, dtype=rays.origins.dtype, device=rays.origins.device)
-    t_min, t_max = box_intersection(rays, field.bounds, march.near, march.far)
+    near, far = (march.near, march.far) if near_far is None else near_far
+    t_min, t_max = box_intersection(rays, field.bounds, near, far)
     offsets, index, t, positions, density = _march(field, rays, (t_min, t_max), occupancy, march, jitter)
     delta = torch.full_like(t, march.step)
     samples = RaySamples(

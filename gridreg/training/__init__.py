@@ -1,1 +1,37 @@
 """The training loop and what it leaves behind: checkpoints, metrics, renders, curves."""
+
+from gridreg.training.execute import Execution, execute
+from gridreg.training.options import TrainOptions, configure, output_folder
+from gridreg.training.presets import load_preset, preset_names
+from gridreg.training.run import (
+    LoadedRun,
+    build_trainer,
+    load_run,
+    open_scene,
+    regularizers_of,
+    resume_trainer,
+    save_run,
+)
+from gridreg.training.settings import RunConfig, TrainSettings
+from gridreg.training.trainer import StepReport, Trainer
+
+__all__ = [
+    "Execution",
+    "LoadedRun",
+    "RunConfig",
+    "StepReport",
+    "TrainOptions",
+    "TrainSettings",
+    "Trainer",
+    "build_trainer",
+    "configure",
+    "execute",
+    "load_preset",
+    "load_run",
+    "open_scene",
+    "output_folder",
+    "preset_names",
+    "regularizers_of",
+    "resume_trainer",
+    "save_run",
+]

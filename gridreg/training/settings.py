@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 from gridreg.errors import InputError
@@ -112,7 +113,7 @@ class RunConfig:
         backbone: name of a registered field (``vm``, ``cp``, ``mlp``).
         field: options of that field's constructor.
         train: the schedule.
-        composition: regularizers as plain data, see `gridreg.from_config`.
+        composition: regularizers as plain data, see `gridreg.from_config`; or the name of a composition.
         seed: of every random number.
     """
 
@@ -120,7 +121,7 @@ class RunConfig:
     scene: str | None = None
     protocol: str | None = None
     backbone: str = "vm"
-    field: dict[str, Any] = field(default_factory=dict)
-    train: TrainSettings = field(default_factory=TrainSettings)
-    composition: list[dict[str, Any]] = field(default_factory=list)
+    field: dict[str, Any] = dataclasses.field(default_factory=dict)
+    train: TrainSettings = dataclasses.field(default_factory=TrainSettings)
+    composition: str | list[dict[str, Any]] = dataclasses.field(default_factory=list)
     seed: int = 0

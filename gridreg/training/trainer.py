@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import nullcontext
 from typing import Any
 
 import torch
@@ -48,6 +49,7 @@ class Trainer:
         self.occupancy = OccupancyGrid.full(field.bounds, events.occupancy_resolution(field, settings))
         self._restart_at = 0
         self.optimizer = self._make_optimizer()
+        self._gradient_context = getattr(field, "gradient_context", nullcontext)
         if settings.carve:
             events.carve(self)
         if 0 in settings.filter_rays_at:
@@ -82,6 +84,7 @@ class Trainer:
         factor = self.settings.learning_rate_decay**progress
         for group in self.optimizer.param_groups:
             group["lr"] = group["initial_lr"] * factor
+        self.handle.update_groups(self.optimizer.param_groups)
 
     def restart_optimizer(self) -> None:
         """A fresh optimizer for replaced parameters; the decay starts anew if the settings say so."""
@@ -97,10 +100,16 @@ class Trainer:
         background = self.handle.background(len(rays), self.generator, default.expand(len(rays), 3))
         target = rgba[:, :3] * rgba[:, 3:] + (1 - rgba[:, 3:]) * background
         march = self.march
-        near, far = self.handle.near_far(march.near, march.far)
-        march = March(march.step, near, far, march.transmittance_bound, march.weight_bound)
+        ones = torch.ones_like(jitter)
         rendered = render_rays(
-            self.field, rays, self.occupancy, march, background=background, jitter=jitter, hook=self.handle
+            self.field,
+            rays,
+            self.occupancy,
+            march,
+            background=background,
+            jitter=jitter,
+            near_far=self.handle.near_far(march.near * ones, march.far * ones),
+            hook=self.handle,
         )
         return rendered, target
 
@@ -122,7 +131,8 @@ class Trainer:
         if not getattr(self.optimizer, "zeroes_gradients", False):
             self.optimizer.zero_grad(set_to_none=True)
         if loss.requires_grad:
-            loss.backward()  # type: ignore[no-untyped-call]
+            with self._gradient_context():
+                loss.backward()  # type: ignore[no-untyped-call]
         report = StepReport(loss=value, mse=mse.item(), psnr=-10 * math.log10(max(mse.item(), 1e-12)))
         report.update({name: float(term) for name, term in self.handle.terms.items()})
         if folded:

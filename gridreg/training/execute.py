@@ -1,0 +1,225 @@
+"""A run from start to scored end, with everything it leaves in its output folder."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gridreg.errors import InputError
+from gridreg.scenes import Scene
+from gridreg.training.checkpoint import has_checkpoint
+from gridreg.training.config import save_yaml, to_data
+from gridreg.training.curves import History, draw_curves, draw_masks
+from gridreg.training.evaluate import Scored, mean_psnr_of, score_views
+from gridreg.training.files import check_output_folder
+from gridreg.training.outputs import metrics_record, save_contact_sheet, save_metrics, save_view
+from gridreg.training.progress import Interruption, Progress, interruptible
+from gridreg.training.run import build_trainer, resume_trainer, save_run
+from gridreg.training.settings import RunConfig
+from gridreg.training.trainer import StepReport, Trainer
+
+__all__ = ["Execution", "execute"]
+
+
+@dataclass
+class Execution:
+    """A run under way.
+
+    Args:
+        config: what determines it.
+        scene: what it reconstructs.
+        out: its folder.
+        trainer: where it stands.
+        history: its curves so far.
+        seconds: by phase: ``setup``, ``train``, ``test``.
+    """
+
+    config: RunConfig
+    scene: Scene
+    out: Path
+    trainer: Trainer
+    history: History
+    seconds: dict[str, float]
+
+    @property
+    def checkpoint(self) -> Path:
+        """Folder of the checkpoint."""
+        return self.out / "checkpoint"
+
+    def save(self) -> None:
+        """Write the checkpoint."""
+        record = {"history": self.history.state_dict(), "seconds": self.seconds}
+        save_run(self.checkpoint, self.trainer, self.config, record)
+
+    def train(self, progress: Progress, interruption: Interruption, on_step: Any = None) -> bool:
+        """Train to the end of the schedule; False if it was interrupted. Saves either way, and on the way."""
+        trainer, settings = self.trainer, self.config.train
+        began = saved = time.perf_counter()
+        before = self.seconds.get("train", 0.0)
+
+        def each(report: StepReport) -> bool:
+            nonlocal saved
+            self.history.record(trainer.step, report)
+            now = time.perf_counter()
+            self.seconds["train"] = before + now - began
+            progress.update(trainer.step, psnr=report["psnr"], loss=report["loss"])
+            self._note_masks()
+            if trainer.step in settings.evaluate_at and trainer.step < settings.steps:
+                self._look(progress)
+            if on_step is not None:
+                on_step(report)
+            if now - saved > 60 * settings.checkpoint_minutes and trainer.step < settings.steps:
+                self.save()
+                saved = time.perf_counter()
+            return not interruption.requested
+
+        try:
+            trainer.train(each=each)
+        except InputError as error:
+            kept = f"the last good checkpoint is {self.checkpoint}" if has_checkpoint(self.checkpoint) else ""
+            raise InputError(f"{error}; {kept or 'no checkpoint was written before'}") from error
+        self.save()
+        return trainer.step >= settings.steps
+
+    def _note_masks(self) -> None:
+        step, total = self.trainer.step, self.config.train.steps
+        if step % max(1, total // 100) == 0:
+            masks = self.trainer.handle.masks()
+            if masks:
+                self.history.add(step, masks={name: mask.tolist() for name, mask in masks.items()})
+
+    def _look(self, progress: Progress) -> None:
+        views = self.scene.validation if self.scene.validation is not None else self.scene.test
+        name = "validation_psnr" if self.scene.validation is not None else "test_psnr"
+        stride = max(1, len(views) // 5)
+        trainer = self.trainer
+        began = time.perf_counter()
+        trainer.field.eval()
+        value = mean_psnr_of(
+            trainer.field, views, trainer.occupancy, trainer.march, self.scene.background, stride
+        )
+        trainer.field.train()
+        # What a look costs is not training time.
+        self.seconds["look"] = self.seconds.get("look", 0.0) + time.perf_counter() - began
+        self.history.add(trainer.step, {name: value, "seconds": self.seconds["train"]})
+        progress.message(f"step {trainer.step}: {name.replace('_', ' ')} {value:.2f} dB")
+
+    def score(self, progress: Progress) -> list[Scored]:
+        """Render and score the test views, each written as soon as it is done."""
+        trainer = self.trainer
+        folder = check_output_folder(self.out / "test")
+        began = time.perf_counter()
+        trainer.handle.step(self.config.train.steps)
+        trainer.field.eval()
+
+        def each(view: Scored) -> None:
+            picture = view.rendered
+            save_view(
+                folder,
+                view.name,
+                picture.colour,
+                view.target,
+                depth=picture.depth,
+                opacity=picture.opacity,
+                metrics=view.metrics,
+            )
+            done.append(view)
+            progress.update(len(done), psnr=view.metrics["psnr"])
+
+        done: list[Scored] = []
+        scored = score_views(
+            trainer.field, self.scene.test, trainer.occupancy, trainer.march, self.scene.background, each
+        )
+        trainer.field.train()
+        self.seconds["test"] = time.perf_counter() - began
+        return scored
+
+    def record(self, scored: Sequence[Scored], command: Sequence[str]) -> dict[str, Any]:
+        """Write ``metrics.json``, the contact sheet and the curves; return the metrics."""
+        scene = self.scene
+        title = f"{scene.name}, {scene.protocol}, {self.config.preset or 'own configuration'}"
+        save_contact_sheet(
+            self.out / "test.png",
+            [view.name for view in scored],
+            [view.rendered.colour for view in scored],
+            [view.target for view in scored],
+            psnrs=[view.metrics["psnr"] for view in scored],
+        )
+        self.history.save(self.out / "history.jsonl")
+        draw_curves(
+            self.history.rows, self.out / "curves.png", title=title, events=self.config.train.resample_at
+        )
+        if any("masks" in row for row in self.history.rows):
+            draw_masks(self.history.rows, self.out / "masks.png", title=title)
+        metrics = metrics_record(
+            {view.name: view.metrics for view in scored},
+            scene=scene.name,
+            protocol=scene.protocol,
+            builtin=scene.builtin,
+            seed=self.config.seed,
+            steps=self.trainer.step,
+            seconds=self.seconds,
+            config=to_data(self.config),
+            command=command,
+            train_views=scene.train.names,
+            uses_alpha=self.config.train.carve,
+        )
+        save_metrics(self.out / "metrics.json", metrics)
+        return metrics
+
+
+def execute(
+    config: RunConfig,
+    scene: Scene,
+    out: str | Path,
+    *,
+    resume: bool = False,
+    command: Sequence[str] = (),
+    on_step: Any = None,
+) -> tuple[Execution, dict[str, Any] | None]:
+    """Train, score and record one run.
+
+    Leaves in ``out``: ``config.yaml``, ``checkpoint/``, ``metrics.json``, ``test/`` and ``test.png``, ``curves.png``,
+    ``masks.png`` and ``history.jsonl``.
+
+    Args:
+        config: what determines the run.
+        scene: opened as the configuration says, see `gridreg.training.open_scene`.
+        out: the output folder.
+        resume: go on from the checkpoint in ``out``.
+        command: the command line, for the record.
+        on_step: called with the `StepReport` of every iteration.
+
+    Returns:
+        The execution, and the metrics, or None if it was interrupted (its checkpoint is saved).
+
+    Raises:
+        InputError: for an unusable folder or checkpoint, or a training that has died.
+    """
+    folder = check_output_folder(out)
+    checkpoint = folder / "checkpoint"
+    if has_checkpoint(checkpoint) and not resume:
+        raise InputError(f"{folder}: holds a run already; resume it with --resume, or choose another output folder")
+    began = time.perf_counter()
+    if resume:
+        trainer, record = resume_trainer(checkpoint, config, scene)
+        history, times = History(), dict(record["seconds"])
+        history.load_state_dict(record["history"])
+    else:
+        trainer, history, times = build_trainer(config, scene), History(max(1, config.train.steps // 200)), {}
+    times["setup"] = times.get("setup", 0.0) + time.perf_counter() - began
+    run = Execution(config, scene, folder, trainer, history, times)
+    save_yaml(folder / "config.yaml", config, comment="Everything that determines this run; pass it with --config.")
+    with interruptible() as interruption:
+        with Progress(config.train.steps, start=trainer.step) as progress:
+            finished = run.train(progress, interruption, on_step)
+        if not finished:
+            print(f"stopped at step {trainer.step}; go on with --resume --out {folder}", file=sys.stderr)
+            return run, None
+        with Progress(len(scene.test), label="test view") as progress:
+            scored = run.score(progress)
+    return run, run.record(scored, command)

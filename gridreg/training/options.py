@@ -1,0 +1,107 @@
+"""The options of a training command, and the configuration they amount to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import torch
+import tyro
+
+from gridreg.errors import InputError
+from gridreg.training.config import assignments, from_yaml, override
+from gridreg.training.presets import load_preset, preset_names
+from gridreg.training.settings import RunConfig
+
+__all__ = ["TrainOptions", "configure", "output_folder"]
+
+
+@dataclass
+class TrainOptions:
+    """Reconstruct a scene from a few pictures with known cameras, score it and save it."""
+
+    scene: Path | None = None
+    """Scene folder in Blender format (transforms_train.json); without one, the built-in scene."""
+    protocol: str | None = None
+    """Which views to train and test on: dietnerf8 (default), gs8, fewtensorf8, human8, human50, views<N>, ..."""
+    preset: str = "quick"
+    """Field, schedule and regularizers by name; `paper` is few_tensorf."""
+    composition: str | None = None
+    """Another named composition of regularizers on the preset's field and schedule."""
+    config: Path | None = None
+    """YAML file whose values replace the preset's, such as the config.yaml of an earlier run."""
+    backbone: str | None = None
+    """vm, cp or mlp."""
+    out: Path | None = None
+    """Output folder; default: outputs/SCENE-PRESET, numbered if that holds a run."""
+    resume: bool = False
+    """Go on from the checkpoint in the output folder."""
+    steps: int | None = None
+    """Iterations; the schedule's events move in proportion."""
+    seed: int | None = None
+    """Of every random number."""
+    threads: int | None = None
+    """Processor threads; default: all cores. Results are the same for the same number."""
+    set: Annotated[tuple[str, ...], tyro.conf.arg(metavar="KEY=VALUE")] = ()
+    """Any other value of the configuration, such as train.rays=2048."""
+    mesh: bool = True
+    """Write mesh.ply."""
+    video: bool = True
+    """Write turntable.mp4."""
+
+
+def configure(options: TrainOptions) -> RunConfig:
+    """The configuration: preset, then the YAML file, then the command line.
+
+    Raises:
+        InputError: for unknown names and values out of range.
+    """
+    preset = "few_tensorf" if options.preset == "paper" else options.preset
+    config = load_preset(preset)
+    if options.config is not None:
+        config = from_yaml(options.config, RunConfig, base=config)
+    changes: dict[str, Any] = {}
+    for name in ("protocol", "backbone", "seed", "composition"):
+        value = getattr(options, name)
+        if value is not None:
+            changes[name] = value
+    if options.scene is not None:
+        changes["scene"] = str(options.scene)
+    if options.backbone is not None and options.backbone != config.backbone:
+        # The options of one field mean nothing to another.
+        changes["field"] = _field_of(options.backbone)
+    config = override(config, {**changes, **assignments(options.set)})
+    if options.steps is not None:
+        if options.steps < 1:
+            raise InputError(f"--steps: found {options.steps}, expected at least 1")
+        config = replace(config, train=config.train.scaled(options.steps))
+    if options.threads is not None:
+        if options.threads < 1:
+            raise InputError(f"--threads: found {options.threads}, expected at least 1")
+        torch.set_num_threads(options.threads)
+    return config
+
+
+def _field_of(backbone: str) -> dict[str, Any]:
+    """The options of the first preset made for a backbone, or none."""
+    for name in preset_names():
+        preset = load_preset(name)
+        if preset.backbone == backbone:
+            return preset.field
+    return {}
+
+
+def output_folder(options: TrainOptions, config: RunConfig) -> Path:
+    """Where the run goes: as told, or a folder of its own below ``outputs``."""
+    if options.out is not None:
+        return options.out
+    if options.resume:
+        raise InputError("--resume: expected the run's folder with --out")
+    scene = "builtin" if config.scene is None else Path(config.scene).resolve().name
+    base = Path("outputs") / f"{scene}-{config.preset or 'run'}"
+    number, found = 1, base
+    while (found / "checkpoint").exists():
+        number += 1
+        found = base.with_name(f"{base.name}-{number}")
+    return found

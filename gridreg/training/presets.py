@@ -1,0 +1,38 @@
+"""Presets: complete configurations by name, kept as YAML."""
+
+from __future__ import annotations
+
+import difflib
+from pathlib import Path
+
+from gridreg.errors import InputError
+from gridreg.training.config import from_yaml
+from gridreg.training.settings import RunConfig
+
+__all__ = ["load_preset", "preset_names"]
+
+
+def _folder() -> Path:
+    """Installed beside this file; in a checkout, ``examples/configs``, where a reader looks for them."""
+    installed = Path(__file__).parent / "presets"
+    return installed if installed.is_dir() else Path(__file__).parents[2] / "examples" / "configs"
+
+
+def preset_names() -> list[str]:
+    """Names that `load_preset` accepts."""
+    return sorted(path.stem for path in _folder().glob("*.yaml"))
+
+
+def load_preset(name: str) -> RunConfig:
+    """The configuration of a preset.
+
+    Raises:
+        InputError: if there is none of this name, with the names there are.
+    """
+    names = preset_names()
+    if name not in names:
+        near = difflib.get_close_matches(name, names, n=1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        raise InputError(f"preset: found {name!r}, expected one of {', '.join(names)}{hint}")
+    config = from_yaml(_folder() / f"{name}.yaml", RunConfig)
+    return RunConfig(**{**config.__dict__, "preset": name})

@@ -1,0 +1,143 @@
+"""One run from a configuration to an output folder: train, checkpoint, score, draw."""
+
+from __future__ import annotations
+
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+import gridreg
+from gridreg.base import Regularizer
+from gridreg.errors import InputError
+from gridreg.fields import make_field
+from gridreg.rendering import March, OccupancyGrid
+from gridreg.scenes import Scene, builtin_scene, load_scene
+from gridreg.training import events
+from gridreg.training.checkpoint import load_checkpoint, save_checkpoint
+from gridreg.training.config import from_data, to_data
+from gridreg.training.settings import RunConfig
+from gridreg.training.trainer import Trainer, load_field
+
+__all__ = ["LoadedRun", "build_trainer", "load_run", "open_scene", "regularizers_of", "resume_trainer", "save_run"]
+
+
+def open_scene(config: RunConfig, cache: Path, validation: int | None = None) -> Scene:
+    """The scene of a configuration; without one, the built-in scene, made in ``cache`` if it is not there.
+
+    Args:
+        config: names scene and protocol.
+        cache: folder for the built-in scene.
+        validation: how many views to read for tuning, outside the protocol's.
+    """
+    if config.scene is None:
+        return load_scene(builtin_scene(cache), config.protocol or "builtin8", validation=validation)
+    return load_scene(config.scene, config.protocol or "dietnerf8", validation=validation)
+
+
+def regularizers_of(config: RunConfig) -> list[Regularizer]:
+    """The composition of a configuration."""
+    if isinstance(config.composition, str):
+        return list(gridreg.composition(config.composition))
+    return list(gridreg.from_config(config.composition))
+
+
+def build_trainer(config: RunConfig, scene: Scene) -> Trainer:
+    """Field and trainer of a configuration, at step 0."""
+    settings = config.train
+    bounds = events.carved_box(scene) if settings.carve else scene.bounds
+    field = make_field(
+        config.backbone,
+        bounds,
+        events.resolution_of(settings.voxels_start, bounds),
+        generator=torch.Generator().manual_seed(config.seed),
+        **config.field,
+    )
+    return Trainer(field, scene, regularizers_of(config), settings, seed=config.seed)
+
+
+def save_run(folder: Path, trainer: Trainer, config: RunConfig, record: dict[str, Any]) -> None:
+    """Write a checkpoint: whole or not at all.
+
+    Args:
+        folder: the checkpoint's.
+        record: what else belongs to the run so far, as plain data (history, seconds).
+    """
+    state = {
+        "trainer": trainer.state_dict(),
+        "march": {"near": trainer.scene.near, "far": trainer.scene.far},
+        "bounds": trainer.scene.bounds,
+        "background": trainer.scene.background,
+        "record": record,
+    }
+    save_checkpoint(folder, state, config=to_data(config), fingerprint=trainer.scene.fingerprint)
+
+
+def resume_trainer(folder: Path, config: RunConfig, scene: Scene) -> tuple[Trainer, dict[str, Any]]:
+    """The trainer as it was when the checkpoint was written, and the record saved with it.
+
+    Raises:
+        InputError: if the checkpoint is missing, damaged, of another scene or of another configuration.
+    """
+    saved = load_checkpoint(folder, fingerprint=scene.fingerprint)
+    theirs, ours = dict(saved.config), dict(to_data(config))
+    # Where the scene lies and how often to save do not change what is computed.
+    for plain in (theirs, ours):
+        plain.pop("scene", None)
+        plain["train"] = {k: v for k, v in plain["train"].items() if k != "checkpoint_minutes"}
+    if theirs != ours:
+        different = sorted(key for key in {*theirs, *ours} if theirs.get(key) != ours.get(key))
+        raise InputError(
+            f"{folder}: a checkpoint of another configuration (differs in {', '.join(different)}); "
+            "resume with the configuration it was started with, or choose another output folder"
+        )
+    trainer = build_trainer(config, scene)
+    trainer.load_state_dict(saved.state["trainer"])
+    return trainer, saved.state["record"]
+
+
+@dataclass(frozen=True)
+class LoadedRun:
+    """A trained field and all it takes to render it."""
+
+    field: Any
+    occupancy: OccupancyGrid
+    march: March
+    background: torch.Tensor
+    config: RunConfig
+    step: int
+
+
+def load_run(folder: str | Path) -> LoadedRun:
+    """Read a checkpoint for rendering, without its scene.
+
+    Args:
+        folder: a checkpoint, or an output folder that holds one.
+
+    Raises:
+        InputError: if there is none, or it is damaged.
+    """
+    path = Path(folder)
+    path = path / "checkpoint" if (path / "checkpoint").exists() else path
+    saved = load_checkpoint(path)
+    config = from_data(RunConfig, saved.config, source=str(path))
+    state = saved.state["trainer"]
+    bounds = state["field"]["bounds"]
+    field = make_field(config.backbone, bounds, tuple(state["resolution"]) or (128,) * 3, **config.field)
+    load_field(field, state)
+    # Masks that are not yet open are part of what was trained.
+    handle = gridreg.apply(field, *regularizers_of(config), total_steps=config.train.steps, seed=config.seed)
+    handle.load_state_dict(state["handle"])
+    field.eval()
+    march = March(
+        step=config.train.step_ratio * events.cell_size(field),
+        near=saved.state["march"]["near"],
+        far=saved.state["march"]["far"],
+        transmittance_bound=config.train.transmittance_bound,
+        weight_bound=config.train.weight_bound,
+    )
+    return LoadedRun(
+        field, OccupancyGrid(**state["occupancy"]), march, saved.state["background"], config, int(state["step"])
+    )
