@@ -109,9 +109,20 @@ class TestJson:
         refused(scene, rf"transforms_train\.json: frame 0: {pattern}")
 
     @pytest.mark.parametrize("key", ["k1", "k2", "k3", "k4", "p1", "p2"])
-    def test_lens_distortion_is_refused_by_name(self, scene: Path, key: str) -> None:
-        edit(scene, lambda c: c.update({key: 0.01}))
-        refused(scene, rf"lens distortion {key} = 0\.01 is not supported")
+    def test_lens_distortion_that_is_no_number(self, scene: Path, key: str) -> None:
+        edit(scene, lambda c: c.update({key: "strong"}))
+        refused(scene, rf"frame 0: {key} is 'strong', expected a finite number")
+
+    def test_lens_distortion_too_strong_to_undo(self, scene: Path) -> None:
+        edit(scene, lambda c: c.update(k1=-500.0))
+        refused(scene, r"transforms_train\.json: frame 0: lens distortion .*k1=-500\.0.* is too strong")
+
+    @pytest.mark.parametrize(
+        "lens", [{"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": True}, {"camera_model": 3}]
+    )
+    def test_fisheyes_are_refused_by_name(self, scene: Path, lens: dict[str, Any]) -> None:
+        edit(scene, lambda c: c.update(lens))
+        refused(scene, r"frame 0: camera_model is .*, expected one of OPENCV, PINHOLE")
 
 
 def spoil(matrix: list[list[float]], kind: str) -> object:

@@ -9,10 +9,12 @@ from typing import Any
 
 from gridreg.errors import InputError
 from gridreg.scenes.frames import Camera, Frame, SceneFiles, check_pose
+from gridreg.scenes.lens import Distortion
 
-__all__ = ["read_blender", "read_json"]
+__all__ = ["read_blender", "read_camera", "read_frames", "read_json"]
 
-_DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+_DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+_LENSES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "FULL_OPENCV", "PERSPECTIVE")
 
 
 def read_blender(folder: Path) -> SceneFiles:
@@ -22,11 +24,10 @@ def read_blender(folder: Path) -> SceneFiles:
     of another aspect; ``fl_x`` and ``fl_y`` count, and square pixels are assumed where they are missing.
 
     Raises:
-        InputError: for a missing file or key, a number that is not one, a pose that is not rigid, or a lens
-            that distorts.
+        InputError: for a missing file or key, a number that is not one, or a pose that is not rigid.
     """
     sources = {split: folder / f"transforms_{split}.json" for split in ("train", "test")}
-    lists = {split: _read_frames(path) for split, path in sources.items()}
+    lists = {split: read_frames(path, read_json(path)) for split, path in sources.items()}
     return SceneFiles(folder, lists["train"], lists["test"], sources)
 
 
@@ -49,8 +50,12 @@ def read_json(path: Path) -> dict[str, Any]:
     return content
 
 
-def _read_frames(path: Path) -> list[Frame]:
-    content = read_json(path)
+def read_frames(path: Path, content: dict[str, Any]) -> list[Frame]:
+    """Read the frame list of a transforms file.
+
+    Raises:
+        InputError: see :func:`read_blender`.
+    """
     frames = content.get("frames")
     if frames is None:
         raise InputError(f"{path}: key 'frames' is missing")
@@ -69,20 +74,23 @@ def _read_frame(shared: dict[str, Any], entry: object, where: str) -> Frame:
         raise InputError(f"{where}: file_path is a {type(entry['file_path']).__name__}, expected a string")
     # A frame's own intrinsics win over those of the file.
     camera = read_camera({**shared, **entry}, where)
-    return Frame(entry["file_path"], check_pose(entry["transform_matrix"], where), camera, where)
+    mask_path = entry.get("mask_path")
+    if mask_path is not None and not isinstance(mask_path, str):
+        raise InputError(f"{where}: mask_path is a {type(mask_path).__name__}, expected a string")
+    pose = check_pose(entry["transform_matrix"], where)
+    return Frame(entry["file_path"], pose, camera, where, mask_path)
 
 
 def read_camera(values: dict[str, Any], where: str) -> Camera:
     """Read intrinsics by the keys of nerf_synthetic and instant-ngp.
 
     Raises:
-        InputError: when a number is out of range, the lens distorts, or no focal length is there.
+        InputError: when a number is out of range, the lens is a fisheye, or no focal length is there.
     """
-    for key in _DISTORTION:
-        if _number(values, key, where) not in (None, 0.0):
-            raise InputError(
-                f"{where}: lens distortion {key} = {values[key]} is not supported here, expected 0"
-            )
+    lens = values.get("camera_model", "FISHEYE" if values.get("is_fisheye") else "OPENCV")
+    if not isinstance(lens, str) or lens.upper() not in _LENSES:
+        raise InputError(f"{where}: camera_model is {lens!r}, expected one of {', '.join(_LENSES)}")
+    distortion = Distortion(**{key: _number(values, key, where) or 0.0 for key in _DISTORTION})
     angle = _number(values, "camera_angle_x", where)
     fx, fy = _number(values, "fl_x", where), _number(values, "fl_y", where)
     if fx is None and angle is None:
@@ -104,6 +112,7 @@ def read_camera(values: dict[str, Any], where: str) -> Camera:
         cy=_number(values, "cy", where),
         width=None if width is None else int(width),
         height=None if height is None else int(height),
+        distortion=distortion,
     )
 
 

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridreg.errors import InputError
+from gridreg.scenes.views import Scene
 
-__all__ = ["Extent", "blender_extent", "camera_extent", "focus_point"]
+__all__ = ["Extent", "blender_extent", "camera_extent", "check_box", "focus_point", "points_extent"]
 
 
 class Extent(NamedTuple):
@@ -77,3 +78,91 @@ def blender_extent(
     if bool(((radius >= 3) & (radius <= 5) & (along > 0) & (miss <= 0.5)).all()):
         return Extent(2.0, 6.0, np.array([[-1.5] * 3, [1.5] * 3]))
     return camera_extent(poses, intrinsics, size)
+
+
+def points_extent(poses: NDArray[np.float64], points: NDArray[np.float64]) -> Extent:
+    """Derive the box from points known to lie on surfaces, such as those of structure from motion.
+
+    The box holds the middle 98 % of them along each axis, and a tenth of its edge more on each side; near
+    and far are the least and greatest depths at which cameras see points of the box, with a tenth of slack.
+
+    Args:
+        poses: ``(V, 4, 4)`` camera-to-world.
+        points: ``(P, 3)`` world.
+
+    Raises:
+        InputError: when no camera has a point before it.
+    """
+    low, high = np.quantile(points, [0.01, 0.99], axis=0)
+    margin = 0.1 * np.maximum(high - low, 0.1 * (high - low).max() + 1e-6)
+    bounds = np.stack([low - margin, high + margin])
+    inside = points[((points >= bounds[0]) & (points <= bounds[1])).all(axis=1)]
+    offset = inside[None] - poses[:, None, :3, 3]
+    before = (offset * -poses[:, None, :3, 2]).sum(axis=-1) > 0
+    distance = np.linalg.norm(offset, axis=-1)[before]
+    if not len(distance):
+        raise InputError("cameras: none has a point of the model before it; give bounds, near and far")
+    return Extent(0.9 * float(np.quantile(distance, 0.001)), 1.1 * float(distance.max()), bounds)
+
+
+def check_box(scene: Scene, points: NDArray[np.float64] | None = None) -> None:
+    """Make sure that the scene's box can hold something.
+
+    Args:
+        scene: whose box, near and far are checked against its training cameras.
+        points: ``(P, 3)`` points of which the box must hold at least one.
+
+    Raises:
+        InputError: when no training camera sees the box between near and far, or it holds none of the points.
+    """
+    low, high = scene.bounds.numpy().astype(np.float64)
+    if points is not None and not ((points >= low) & (points <= high)).all(axis=1).any():
+        raise InputError(
+            f"bounds: the box {scene.bounds.tolist()} holds none of the scene's {len(points)} points"
+        )
+    if scene.ndc or not len(scene.train):
+        return
+    steps = np.linspace(0, 1, 9)
+    grid = low + np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3) * (high - low)
+    for pose, values in zip(scene.train.poses.numpy(), scene.train.intrinsics.numpy(), strict=True):
+        if _sees_points(grid, pose, values, scene) or _meets_box(low, high, pose, values, scene):
+            return
+    raise InputError(
+        f"bounds: no training camera sees the box {scene.bounds.tolist()} between "
+        f"near {scene.near:g} and far {scene.far:g}"
+    )
+
+
+def _sees_points(
+    points: NDArray[np.float64], pose: NDArray[np.float64], values: NDArray[np.float64], scene: Scene
+) -> bool:
+    """Whether any of the points lies in the image, between near and far: finds small boxes."""
+    local = (points - pose[:3, 3]) @ pose[:3, :3]
+    depth = -local[:, 2]
+    safe = np.maximum(depth, 1e-9)
+    column = local[:, 0] / safe * values[0] + values[2]
+    row = -local[:, 1] / safe * values[1] + values[3]
+    distance = np.linalg.norm(local, axis=-1)
+    seen = (depth > 0) & (distance >= scene.near) & (distance <= scene.far)
+    seen &= (column >= 0) & (column <= scene.train.width) & (row >= 0) & (row <= scene.train.height)
+    return bool(seen.any())
+
+
+def _meets_box(
+    low: NDArray[np.float64],
+    high: NDArray[np.float64],
+    pose: NDArray[np.float64],
+    values: NDArray[np.float64],
+    scene: Scene,
+) -> bool:
+    """Whether a ray of a coarse grid of pixels meets the box between near and far: finds large boxes."""
+    columns, rows = np.meshgrid(np.linspace(0, scene.train.width, 17), np.linspace(0, scene.train.height, 17))
+    local = np.stack(
+        [(columns - values[2]) / values[0], -(rows - values[3]) / values[1], -np.ones_like(rows)], axis=-1
+    ).reshape(-1, 3)
+    direction = local / np.linalg.norm(local, axis=-1, keepdims=True) @ pose[:3, :3].T
+    inverse = 1 / np.where(np.abs(direction) < 1e-9, 1e-9, direction)
+    a, b = (low - pose[:3, 3]) * inverse, (high - pose[:3, 3]) * inverse
+    entry = np.maximum(np.minimum(a, b).max(axis=-1), scene.near)
+    leave = np.minimum(np.maximum(a, b).min(axis=-1), scene.far)
+    return bool((entry < leave).any())

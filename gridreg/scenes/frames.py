@@ -5,11 +5,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gridreg.errors import InputError
+from gridreg.scenes.extent import Extent
+from gridreg.scenes.lens import NO_DISTORTION, Distortion
 
 __all__ = ["Camera", "Frame", "SceneFiles", "check_pose", "resolve_inside"]
 
@@ -25,6 +28,7 @@ class Camera:
         fx, fy: focal lengths in pixels; ``fy`` defaults to ``fx``.
         cx, cy: principal point in pixels; defaults to the image's centre.
         width, height: size in pixels, checked against the image when given.
+        distortion: of the lens.
     """
 
     angle_x: float | None = None
@@ -34,6 +38,12 @@ class Camera:
     cy: float | None = None
     width: int | None = None
     height: int | None = None
+    distortion: Distortion = NO_DISTORTION
+
+    @property
+    def size(self) -> tuple[int, int] | None:
+        """Width and height, when both are given."""
+        return None if self.width is None or self.height is None else (self.width, self.height)
 
     def intrinsics(self, width: int, height: int) -> tuple[float, float, float, float]:
         """Return ``(fx, fy, cx, cy)`` in pixels for an image of this size."""
@@ -57,12 +67,14 @@ class Frame:
         pose: ``(4, 4)`` camera-to-world.
         camera: its intrinsics.
         where: file and frame number, for messages.
+        mask_path: path of a mask that becomes alpha, relative to the scene folder.
     """
 
     file_path: str
     pose: NDArray[np.float64]
     camera: Camera
     where: str
+    mask_path: str | None = None
 
 
 @dataclass(frozen=True)
@@ -73,12 +85,40 @@ class SceneFiles:
         folder: the scene folder.
         train, test: frame lists that protocols index.
         sources: the file behind each list, for messages.
+        opaque: whether images without alpha are what the format is made for.
+        as_stored: whether cameras belong to images as they are stored, whatever EXIF says of their
+            orientation.
+        points: ``(P, 3)`` points known to lie on surfaces, world.
+        extent: near, far and box, where the format states them.
+        ndc: whether rays are to be mapped to normalised device coordinates.
+        split_here: whether the format has one list and the test frames were held out of it by this reader.
     """
 
     folder: Path
     train: list[Frame]
     test: list[Frame]
     sources: dict[str, Path]
+    opaque: bool = False
+    as_stored: bool = False
+    points: NDArray[np.float64] | None = None
+    extent: Extent | None = None
+    ndc: bool = False
+    split_here: bool = False
+
+    @staticmethod
+    def held_out(folder: Path, frames: list[Frame], source: Path, **options: Any) -> SceneFiles:
+        """Split one list: every eighth frame from the first is for testing (LLFF's convention), the others
+        train.
+
+        Raises:
+            InputError: for fewer than two frames.
+        """
+        if len(frames) < 2:
+            raise InputError(f"{source}: found {len(frames)} frames, expected at least 2 (one is held out)")
+        train = [frame for i, frame in enumerate(frames) if i % 8]
+        return SceneFiles(
+            folder, train, frames[::8], {"train": source, "test": source}, split_here=True, **options
+        )
 
 
 def check_pose(matrix: object, where: str) -> NDArray[np.float64]:

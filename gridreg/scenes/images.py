@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import struct
+import warnings
 import zlib
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from PIL import Image
 from gridreg.errors import InputError
 from gridreg.scenes.png16 import decode_png16, is_png16
 
-__all__ = ["area_mean", "read_rgba"]
+__all__ = ["area_mean", "read_mask", "read_rgba", "upright"]
 
 _DECODER_ERRORS = (
     OSError,
@@ -25,32 +26,40 @@ _DECODER_ERRORS = (
     zlib.error,
     Image.DecompressionBombError,
 )
+_ORIENTATION = 274
+_TURNS = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_270,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}
 
 
-def read_rgba(path: Path, *, opaque: bool = False) -> NDArray[np.float32]:
-    """Read a PNG or JPEG (or anything else Pillow knows) as float RGBA.
+def read_rgba(
+    path: Path, *, opaque: bool = False, stated: tuple[int, int] | None = None, as_stored: bool = False
+) -> NDArray[np.float32]:
+    """Read a PNG or JPEG (or anything else Pillow knows) as float RGBA, turned upright as its EXIF data say.
 
     Args:
         path: the file.
         opaque: give images without alpha an alpha of 1 instead of refusing them.
+        stated: width and height of the camera: where EXIF would swap the two, they say whether to turn.
+        as_stored: do not turn the image where the size does not tell.
 
     Returns:
         ``(H, W, 4)`` float32 in [0, 1] with straight alpha.
 
     Raises:
-        InputError: when the file is missing, cannot be decoded or has no alpha channel.
+        InputError: when the file is missing, cannot be decoded, has no alpha channel or broken EXIF data.
     """
+    data = _read_bytes(path)
     try:
-        data = path.read_bytes()
-    except FileNotFoundError:
-        raise InputError(f"{path}: image not found") from None
-    except OSError as error:
-        raise InputError(f"{path}: image cannot be read ({error.strerror})") from None
-    try:
-        rgba = decode_png16(data) if is_png16(data) else _decode(data)
+        rgba = decode_png16(data) if is_png16(data) else _decode(data, path, stated, as_stored)
     except _DECODER_ERRORS as error:
-        reason = " ".join(str(error).replace(str(path), "").split()) or type(error).__name__
-        raise InputError(f"{path}: not a whole image ({reason})") from None
+        raise _not_whole(path, error) from None
     if rgba.shape[-1] == 3:
         if not opaque:
             raise InputError(f"{path}: image has no alpha channel, expected RGBA")
@@ -58,9 +67,82 @@ def read_rgba(path: Path, *, opaque: bool = False) -> NDArray[np.float32]:
     return rgba
 
 
-def _decode(data: bytes) -> NDArray[np.float32]:
+def read_mask(path: Path) -> NDArray[np.float32]:
+    """Read a mask: white (or opaque, where it has alpha) is kept, black is background.
+
+    Returns:
+        ``(H, W)`` float32 in [0, 1].
+
+    Raises:
+        InputError: when the file is missing or cannot be decoded.
+    """
+    data = _read_bytes(path)
+    try:
+        with Image.open(io.BytesIO(data)) as image:
+            if image.has_transparency_data:
+                grey = image.convert("RGBA").getchannel("A")
+            elif image.mode.startswith("I;16"):
+                grey = Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
+            else:
+                grey = image.convert("L")
+            mask: NDArray[np.float32] = np.divide(np.asarray(grey), 255, dtype=np.float32)
+            return mask
+    except _DECODER_ERRORS as error:
+        raise _not_whole(path, error) from None
+
+
+def upright(image: Image.Image, path: Path) -> int:
+    """Return the EXIF orientation of an opened image: 1 is upright, 5 to 8 swap width and height.
+
+    Raises:
+        InputError: for EXIF data that cannot be read.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            # Read anew, because opening a JPEG has tried already and keeps silent about damage.
+            Image.Exif().load(image.info.get("exif", b""))
+            orientation = image.getexif().get(_ORIENTATION, 1)
+    except (*_DECODER_ERRORS, Warning) as error:
+        raise InputError(
+            f"{path}: EXIF data cannot be read ({_one_line(error, path)}), save it anew"
+        ) from None
+    if orientation not in range(1, 9):
+        raise InputError(f"{path}: EXIF orientation is {orientation!r}, expected 1 to 8")
+    return int(orientation)
+
+
+def _read_bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except FileNotFoundError:
+        raise InputError(f"{path}: image not found") from None
+    except OSError as error:
+        raise InputError(f"{path}: image cannot be read ({error.strerror})") from None
+
+
+def _not_whole(path: Path, error: Exception) -> InputError:
+    if isinstance(error, InputError):
+        return error
+    return InputError(f"{path}: not a whole image ({_one_line(error, path)})")
+
+
+def _one_line(error: Exception, path: Path) -> str:
+    return " ".join(str(error).replace(str(path), "").split()) or type(error).__name__
+
+
+def _decode(data: bytes, path: Path, stated: tuple[int, int] | None, as_stored: bool) -> NDArray[np.float32]:
     """Decode to ``(H, W, 3)`` or ``(H, W, 4)``, whichever the file holds."""
-    with Image.open(io.BytesIO(data)) as image:
+    with Image.open(io.BytesIO(data)) as opened:
+        image: Image.Image = opened
+        # Pillow reads a PNG to its end to find EXIF data: a cut image has to fail before.
+        opened.load()
+        turned = upright(opened, path)
+        if turned != 1:
+            sideways = turned >= 5 and opened.width != opened.height
+            keep = opened.size == stated if sideways and stated is not None else as_stored
+            if not keep:
+                image = opened.transpose(_TURNS[turned])
         if image.mode.startswith("I;16"):
             grey: NDArray[np.float32] = np.divide(np.asarray(image), 65535, dtype=np.float32)
             return np.repeat(grey[..., None], 3, axis=-1)

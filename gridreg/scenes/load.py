@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,13 +12,16 @@ from torch import Tensor
 
 from gridreg.errors import InputError
 from gridreg.scenes.blender import read_blender
-from gridreg.scenes.extent import blender_extent
-from gridreg.scenes.frames import Frame, SceneFiles, resolve_inside
-from gridreg.scenes.images import area_mean, read_rgba
+from gridreg.scenes.colmap import find_models, read_colmap
+from gridreg.scenes.extent import Extent, blender_extent, check_box, points_extent
+from gridreg.scenes.frames import SceneFiles
+from gridreg.scenes.llff import read_llff
 from gridreg.scenes.protocols import Protocol, get_protocol
+from gridreg.scenes.reader import ViewReader
+from gridreg.scenes.transforms import read_transforms
 from gridreg.scenes.views import Scene, Views, background_colour
 
-__all__ = ["BUILTIN_MARKER", "load_scene"]
+__all__ = ["BUILTIN_MARKER", "load_scene", "read_folder"]
 
 BUILTIN_MARKER = "builtin.json"
 """File that marks a folder as the built-in scene."""
@@ -41,7 +43,10 @@ def load_scene(
     """Read a scene under a protocol.
 
     Args:
-        folder: the scene folder.
+        folder: the scene folder: Blender's ``transforms_train.json`` and ``transforms_test.json``; or one
+            list of frames, every eighth of which is held out and makes the test views: ``transforms.json``
+            (nerfstudio, instant-ngp), a COLMAP model in ``sparse/0`` beside ``images/``, or LLFF's
+            ``poses_bounds.npy``.
         protocol: a name (see :func:`get_protocol`) or a protocol of one's own.
         size: width of the images in pixels; it must divide what is stored, and replaces the protocol's rule.
         test: indices into the test frames instead of the protocol's; an empty one reads none.
@@ -58,26 +63,25 @@ def load_scene(
     """
     folder = Path(folder)
     protocol = get_protocol(protocol) if isinstance(protocol, str) else protocol
-    files = _read_folder(folder)
+    files = read_folder(folder)
     positions = np.stack([frame.pose[:3, 3] for frame in files.train])
     train_ids = _checked(protocol.train.select(positions), files, "train", f"protocol {protocol.name}")
-    if test is None:
+    if test is None and files.split_here:
+        # The held-out frames are the test views; a protocol's rule would thin them out a second time.
+        test_ids = tuple(range(len(files.test)))
+    elif test is None:
         test_positions = np.stack([frame.pose[:3, 3] for frame in files.test])
         test_ids = _checked(protocol.test.select(test_positions), files, "test", f"protocol {protocol.name}")
     else:
         test_ids = _checked(tuple(test), files, "test", "test")
     validation_ids = _validation_ids(validation, train_ids, files)
 
-    reader = _ViewReader(folder, protocol, size, opaque)
+    reader = ViewReader(files, protocol, size, opaque)
     train, fingerprint = reader.read(files.train, train_ids)
     test_views, _ = reader.read(files.test, test_ids)
     validation_views = None if validation is None else reader.read(files.train, validation_ids)[0]
-    extent = blender_extent(
-        train.poses.numpy().astype(np.float64),
-        train.intrinsics.numpy().astype(np.float64),
-        (train.width, train.height),
-    )
-    return Scene(
+    extent = _extent(files, train)
+    scene = Scene(
         name=folder.resolve().name,
         protocol=protocol.name,
         train=train,
@@ -89,15 +93,41 @@ def load_scene(
         fingerprint=fingerprint,
         builtin=(folder / BUILTIN_MARKER).is_file(),
         validation=validation_views,
+        ndc=files.ndc,
     )
+    check_box(scene, files.points if bounds is not None else None)
+    return scene
 
 
-def _read_folder(folder: Path) -> SceneFiles:
+def read_folder(folder: Path) -> SceneFiles:
+    """Recognise the format of a scene folder and read its frame lists, without opening an image.
+
+    Raises:
+        InputError: when it is none of the known formats, or its files are wrong.
+    """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such scene folder")
     if (folder / "transforms_train.json").is_file():
         return read_blender(folder)
-    raise InputError(f"{folder}: not a scene, expected transforms_train.json and transforms_test.json")
+    if (folder / "transforms.json").is_file():
+        return read_transforms(folder)
+    if (folder / "poses_bounds.npy").is_file():
+        return read_llff(folder)
+    if find_models(folder):
+        return read_colmap(folder)
+    raise InputError(
+        f"{folder}: not a scene, expected transforms_train.json and transforms_test.json, transforms.json, "
+        "poses_bounds.npy or a COLMAP model in sparse/0"
+    )
+
+
+def _extent(files: SceneFiles, train: Views) -> Extent:
+    if files.extent is not None:
+        return files.extent
+    poses, size = train.poses.numpy().astype(np.float64), (train.width, train.height)
+    if files.points is not None and not any(frame.mask_path for frame in files.train):
+        return points_extent(poses, files.points)
+    return blender_extent(poses, train.intrinsics.numpy().astype(np.float64), size)
 
 
 def _checked(ids: tuple[int, ...], files: SceneFiles, split: str, by: str) -> tuple[int, ...]:
@@ -136,72 +166,3 @@ def _bounds(bounds: Sequence[Sequence[float]] | Tensor | NDArray[np.float64]) ->
         return torch.as_tensor(np.asarray(bounds), dtype=torch.float32)
     except (TypeError, ValueError):
         raise InputError(f"bounds: found {bounds!r}, expected (2, 3) numbers") from None
-
-
-class _ViewReader:
-    """Opens frames, all to one size."""
-
-    def __init__(self, folder: Path, protocol: Protocol, size: int | None, opaque: bool) -> None:
-        self.folder, self.protocol, self.size, self.opaque = folder, protocol, size, opaque
-        self.stored: tuple[int, int] | None = None
-        self.reduced: tuple[int, ...] = (1, 1)
-
-    def read(self, frames: list[Frame], ids: tuple[int, ...]) -> tuple[Views, str]:
-        digest = hashlib.sha256()
-        images: list[NDArray[np.float32]] = []
-        intrinsics: list[NDArray[np.float64]] = []
-        paths: list[Path] = []
-        for i in ids:
-            frame = frames[i]
-            path = resolve_inside(self.folder, frame.file_path, frame.where)
-            image = read_rgba(path, opaque=self.opaque)
-            height, width = image.shape[:2]
-            self._check_size(path, frame, width, height)
-            factor = self._factor(width, height, path)
-            values = np.array(frame.camera.intrinsics(width, height)) / factor
-            digest.update(f"{i} {factor} {image.shape}".encode() + frame.pose.tobytes() + values.tobytes())
-            digest.update(image.tobytes())
-            images.append(area_mean(image, factor))
-            self.reduced = images[-1].shape[:2]
-            intrinsics.append(values)
-            paths.append(path)
-        views = Views(
-            torch.from_numpy(np.stack(images) if images else np.zeros((0, *self.reduced, 4), np.float32)),
-            torch.tensor(np.array([frames[i].pose for i in ids]).reshape(-1, 4, 4), dtype=torch.float32),
-            torch.tensor(np.array(intrinsics).reshape(-1, 4), dtype=torch.float32),
-            _unique_names(self.folder, paths),
-            ids,
-        )
-        return views, digest.hexdigest()
-
-    def _check_size(self, path: Path, frame: Frame, width: int, height: int) -> None:
-        stated = (frame.camera.width or width, frame.camera.height or height)
-        if (width, height) != stated:
-            raise InputError(
-                f"{path}: image is {width}x{height}, expected w x h of its camera, {stated[0]}x{stated[1]}"
-            )
-        if self.stored is None:
-            self.stored = (width, height)
-        if (width, height) != self.stored:
-            raise InputError(
-                f"{path}: image is {width}x{height}, expected {self.stored[0]}x{self.stored[1]} as before"
-            )
-
-    def _factor(self, width: int, height: int, path: Path) -> int:
-        if self.size is None:
-            factor = 2 if width == self.protocol.halve_at else 1
-        elif self.size < 1 or width % self.size:
-            raise InputError(f"size: found {self.size}, expected a divisor of the width of {path}, {width}")
-        else:
-            factor = width // self.size
-        if height % factor:
-            raise InputError(f"{path}: image is {width}x{height}, expected edges divisible by {factor}")
-        return factor
-
-
-def _unique_names(folder: Path, paths: list[Path]) -> tuple[str, ...]:
-    stems = [path.stem for path in paths]
-    if len(set(stems)) == len(stems):
-        return tuple(stems)
-    root = folder.resolve()
-    return tuple("_".join(path.relative_to(root).with_suffix("").parts) for path in paths)

@@ -22,6 +22,7 @@ __all__ = [
     "Protocol",
     "Seeded",
     "Selection",
+    "Spread",
     "get_protocol",
 ]
 
@@ -76,6 +77,19 @@ class Seeded:
 
 
 @dataclass(frozen=True)
+class Spread:
+    """``count`` frames evenly spread over the list, first and last among them (RegNeRF on LLFF)."""
+
+    count: int
+
+    def select(self, positions: NDArray[np.float64]) -> tuple[int, ...]:
+        """Return ``round(linspace(0, N - 1, count))``."""
+        if self.count > len(positions):
+            return tuple(range(self.count))
+        return tuple(int(i) for i in np.round(np.linspace(0, len(positions) - 1, self.count)))
+
+
+@dataclass(frozen=True)
 class KMeans:
     """The frames nearest to the ``count`` k-means centres of the camera positions (ZeroRF, section 4)."""
 
@@ -112,7 +126,7 @@ class KMeans:
         return tuple(sorted(chosen))
 
 
-Selection = Listed | Every | First | Seeded | KMeans
+Selection = Listed | Every | First | Seeded | Spread | KMeans
 
 
 def _squared_distances(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -159,6 +173,7 @@ PROTOCOLS: dict[str, Protocol] = {
         Protocol(
             "builtin8", First(8), Every(1), None, "white", "the built-in scene; not a published benchmark"
         ),
+        Protocol("holdout8", Every(1), Every(1), None, "white", "own pictures and LLFF: every 8th held out"),
     )
 }
 """The protocols by name; :func:`get_protocol` knows the counted forms as well."""
@@ -168,7 +183,9 @@ def get_protocol(name: str) -> Protocol:
     """Return the protocol of that name.
 
     Besides :data:`PROTOCOLS`, ``views<N>`` stands for N training views by NumPy's seed-0 choice and
-    ``first<N>`` for the first N, both with size, background and test views of ``dietnerf8``.
+    ``first<N>`` for the first N, both with size, background and test views of ``dietnerf8``; ``spread<N>``
+    for N evenly spread over the list and all test views, as stored (RegNeRF's 3, 6 and 9 views of LLFF
+    scenes).
 
     Raises:
         InputError: for an unknown name.
@@ -178,10 +195,14 @@ def get_protocol(name: str) -> Protocol:
     """
     if name in PROTOCOLS:
         return PROTOCOLS[name]
-    counted = re.fullmatch(r"(views|first)([1-9]\d{0,5})", name)
+    counted = re.fullmatch(r"(views|first|spread)([1-9]\d{0,5})", name)
     if counted is None:
         known = ", ".join(PROTOCOLS)
-        raise InputError(f"protocol: found {name!r}, expected one of {known}, views<N> or first<N>")
+        raise InputError(
+            f"protocol: found {name!r}, expected one of {known}, views<N>, first<N> or spread<N>"
+        )
     count = int(counted[2])
+    if counted[1] == "spread":
+        return Protocol(name, Spread(count), Every(1), None, "white", "RegNeRF, on LLFF scenes")
     train: Selection = Seeded(count) if counted[1] == "views" else First(count)
     return Protocol(name, train, Every(8), 800, "white", f"a study with {count} views")

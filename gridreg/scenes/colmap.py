@@ -1,0 +1,126 @@
+"""Reader for scenes whose cameras COLMAP found."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gridreg.errors import InputError
+from gridreg.scenes.colmap_model import ColmapCamera, ColmapImage, ColmapModel, read_model
+from gridreg.scenes.frames import Camera, Frame, SceneFiles, check_pose
+from gridreg.scenes.lens import Distortion
+
+__all__ = ["camera_to_world", "find_models", "frames_of_model", "read_colmap"]
+
+_PLACES = ("sparse", "colmap/sparse", ".")
+
+
+def find_models(folder: Path) -> list[Path]:
+    """Return the folders that hold COLMAP models: ``sparse``, ``sparse/0`` and so on."""
+    models = []
+    for place in _PLACES:
+        base = folder / place
+        inner = (
+            sorted(path for path in base.iterdir() if path.is_dir()) if base.is_dir() and place != "." else []
+        )
+        models += [path for path in [base, *inner] if _is_model(path)]
+    return models
+
+
+def _is_model(folder: Path) -> bool:
+    return any((folder / f"images{suffix}").is_file() for suffix in (".bin", ".txt"))
+
+
+def read_colmap(folder: Path) -> SceneFiles:
+    """Read a COLMAP model beside ``images/`` (and, if there, ``masks/``) without opening an image.
+
+    World coordinates are those of the model; every eighth image by name is held out for testing. A mask is
+    called like its image, with the same extension or ``.png``, or like its image with ``.png`` appended.
+
+    Raises:
+        InputError: when there is more than one model, or it or its pictures cannot be read.
+    """
+    models = find_models(folder)
+    if len(models) != 1:
+        found = ", ".join(str(model.relative_to(folder)) for model in models) or "none"
+        raise InputError(f"{folder}: expected one COLMAP model, found {found}; leave only the one to use")
+    model = read_model(models[0])
+    pictures = next((name for name in ("images", "input") if (folder / name).is_dir()), None)
+    if pictures is None:
+        raise InputError(f"{folder}: folder images/ with the pictures of the COLMAP model not found")
+    frames = frames_of_model(model, folder, pictures, str(models[0]))
+    return SceneFiles.held_out(
+        folder,
+        frames,
+        models[0],
+        opaque=True,
+        as_stored=True,
+        points=model.points if len(model.points) else None,
+    )
+
+
+def frames_of_model(model: ColmapModel, folder: Path, pictures: str, where: str) -> list[Frame]:
+    """Turn a model's images into frames whose paths start with ``pictures``.
+
+    Raises:
+        InputError: for a rotation that is none, or a mask that is missing where others are there.
+    """
+    masks = folder / "masks"
+    return [
+        Frame(
+            file_path=f"{pictures}/{image.name}",
+            pose=camera_to_world(image, f"{where}: image {image.name}"),
+            camera=_to_camera(model.cameras[image.camera_id]),
+            where=f"{where}: image {image.name}",
+            mask_path=_mask_path(masks, image.name) if masks.is_dir() else None,
+        )
+        for image in model.images
+    ]
+
+
+def camera_to_world(image: ColmapImage, where: str) -> NDArray[np.float64]:
+    """Return the ``(4, 4)`` camera-to-world matrix, camera looking along -z with y up.
+
+    Raises:
+        InputError: for numbers that are not finite or a quaternion of length 0.
+    """
+    quaternion = np.array(image.quaternion)
+    length = np.linalg.norm(quaternion)
+    if not np.isfinite(length) or length < 1e-9:
+        raise InputError(f"{where}: rotation {image.quaternion} is no quaternion")
+    w, x, y, z = quaternion / length
+    rotation = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    pose = np.eye(4)
+    pose[:3, :3] = rotation.T * [1, -1, -1]
+    pose[:3, 3] = -rotation.T @ image.translation
+    return check_pose(pose, where)
+
+
+def _to_camera(camera: ColmapCamera) -> Camera:
+    values = camera.parameters
+    fx = values.get("fx", values.get("f"))
+    lens = {key: value for key, value in values.items() if key[0] in "kp"}
+    return Camera(
+        fx=fx,
+        fy=values.get("fy", fx),
+        cx=values["cx"],
+        cy=values["cy"],
+        width=camera.width,
+        height=camera.height,
+        distortion=Distortion(**lens),
+    )
+
+
+def _mask_path(masks: Path, name: str) -> str:
+    for candidate in (name, f"{name}.png", str(Path(name).with_suffix(".png"))):
+        if (masks / candidate).is_file():
+            return f"masks/{candidate}"
+    raise InputError(f"{masks}: no mask for image {name}, expected {name}.png")
