@@ -197,6 +197,6 @@ def encode(x: Tensor, octaves: int, order: Order = "octave", scale: float = 1.0)
         return positional_encoding(x, octaves, order, scale=scale)
     found = encode_together([(x, octaves)], scale)
     # (N, K, sine or cosine, D): the other orders are permutations of it.
-    waves = found[:, x.shape[1] :].reshape(-1, octaves, 2, x.shape[1])
+    waves = found[:, x.shape[1] :].reshape(x.shape[0], octaves, 2, x.shape[1])
     waves = waves.transpose(1, 2) if order == "sines_first" else waves.permute(0, 2, 3, 1)
     return torch.cat([x, waves.flatten(1)], dim=-1)
