@@ -37,11 +37,11 @@ def apply(field: nn.Module, *regularizers: Regularizer, total_steps: int, seed: 
         raise InputError(f"field={type(field).__name__}: expected a torch.nn.Module")
     for regularizer in regularizers:
         _check_regularizer(regularizer)
-    if isinstance(total_steps, bool) or not isinstance(total_steps, int) or total_steps <= 0:
+    if isinstance(total_steps, bool) or not hasattr(total_steps, "__index__") or total_steps <= 0:
         raise InputError(
             f"total_steps={total_steps!r}: expected the number of training steps, an int above 0"
         )
-    return Handle(Attachment(field, regularizers, Clock(total_steps, seed)))
+    return Handle(Attachment(field, regularizers, Clock(int(total_steps), seed)))
 
 
 def _check_regularizer(value: object) -> None:

@@ -68,7 +68,7 @@ class Slot:
         return self.regularizer.transform(value, self.context)
 
     def check(self, value: Tensor) -> None:
-        """Learn the number of channels at the first call, and refuse another number later."""
+        """Learn the number of channels at the first call, and follow it if it changes."""
         place = self.context.place
         if place is None:
             return
@@ -77,15 +77,11 @@ class Slot:
                 f"dim={place.dim} of {place.selector}: {place.name} has shape {tuple(value.shape)}"
             )
         size = value.shape[place.dim]
-        if place.size is None:
-            place.complete(size)
+        if place.size != size:
             # A state that was loaded before the first call is not to be drawn anew.
-            self.refresh(prepare=self.context.prepared_at != self.context.step)
-        elif place.size != size:
-            raise InputError(
-                f"{place.kind}({place.name!r}): {size} channels along dim={place.dim}, "
-                f"but {type(self.regularizer).__name__} was attached to {place.size}"
-            )
+            fresh = place.size is not None or self.context.prepared_at != self.context.step
+            place.complete(size)
+            self.refresh(prepare=fresh)
 
 
 class OutputHook:

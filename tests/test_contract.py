@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import pytest
@@ -42,14 +43,14 @@ def check_mask(mask: gridreg.Mask, place: Place, step: int, total_steps: int) ->
     values = mask_at(mask, place, step, total_steps)
     assert values.dtype == torch.float32
     assert values.shape == (place.channels,)
-    assert 0 <= values.min()
+    assert values.min() >= 0
     assert values.max() <= 1
     ranks = torch.tensor(mask.ranks(place))
     by_rank = [values[ranks == rank] for rank in range(int(ranks.max()) + 1)]
     by_rank = [group for group in by_rank if len(group)]
     assert all((group == group[0]).all() for group in by_rank)
     if mask.monotone():
-        assert all(low[0] >= high[0] for low, high in zip(by_rank, by_rank[1:], strict=False))
+        assert all(low[0] >= high[0] for low, high in pairwise(by_rank))
         assert (mask_at(mask, place, step + 1, total_steps) >= values).all()
     end = mask.end(int(ranks.max()) + 1, total_steps)
     if end is not None:
