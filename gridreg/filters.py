@@ -20,7 +20,7 @@ Boundary: TypeAlias = Literal["periodic", "mirror"]
 _NOTHING = 1e-8
 
 
-def low_pass_response(frequencies: Tensor, highest: int, keep: float) -> Tensor:
+def low_pass_response(frequencies: Tensor, highest: int, keep: float | Tensor) -> Tensor:
     """Factor of each frequency: 1 up to ``keep * highest``, fading to 0 within the next one.
 
     Args:
@@ -39,14 +39,15 @@ def low_pass_response(frequencies: Tensor, highest: int, keep: float) -> Tensor:
 
 
 def fourier_low_pass(
-    values: Tensor, axes: Sequence[int], keep: float, boundary: Boundary = "periodic"
+    values: Tensor, axes: Sequence[int], keep: float | Tensor, boundary: Boundary = "periodic"
 ) -> Tensor:
     """Keep the lowest share of the frequencies along each axis.
 
     Args:
         values: a grid, any shape.
         axes: its spatial axes.
-        keep: share of the spectrum that stays, in [0, 1]: at 0 only the mean, at 1 the values themselves.
+        keep: share of the spectrum that stays, in [0, 1]: at 0 only the mean, at 1 the values themselves. A
+            scalar tensor is not checked, and costs more; compiled code need not be compiled anew for it.
         boundary: "periodic" is the discrete Fourier transform, where opposite borders are neighbours;
             "mirror" the cosine transform, where the grid is continued by its mirror image.
 
@@ -61,23 +62,25 @@ def fourier_low_pass(
         >>> fourier_low_pass(torch.tensor([1.0, 0.0, 1.0, 2.0]), (0,), keep=0.0)
         tensor([1., 1., 1., 1.])
     """
-    if not 0 <= keep <= 1:
-        raise InputError(f"keep={keep}: expected a share of the spectrum in [0, 1]")
     if boundary not in ("periodic", "mirror"):
         raise InputError(f"boundary={boundary!r}: expected 'periodic' or 'mirror'")
+    if isinstance(keep, Tensor):
+        return _filter(values, axes, lambda size: _whole(*_low_pass(size, keep, boundary)))
+    if not 0 <= keep <= 1:
+        raise InputError(f"keep={keep}: expected a share of the spectrum in [0, 1]")
     if keep == 1:
         return values
-    return _filter(values, axes, lambda size: _low_pass(size, keep, boundary))
+    return _filter(values, axes, lambda size: _low_pass_factors(size, keep, boundary))
 
 
-def gaussian_blur(values: Tensor, axes: Sequence[int], radius: float) -> Tensor:
+def gaussian_blur(values: Tensor, axes: Sequence[int], radius: float | Tensor) -> Tensor:
     """Gaussian blur along each axis, the grid continued by its mirror image.
 
     Args:
         values: a grid, any shape.
         axes: its spatial axes.
         radius: standard deviation as a share of the grid's edge: ``n - 1`` voxels times it on an axis of `n`
-            nodes, so that it means the same length after the grid has grown.
+            nodes, so that it means the same length after the grid has grown. A scalar tensor is not checked.
 
     Returns:
         Same shape and dtype, same mean along each axis; `values` itself at radius 0.
@@ -89,40 +92,54 @@ def gaussian_blur(values: Tensor, axes: Sequence[int], radius: float) -> Tensor:
         >>> gaussian_blur(torch.tensor([0.0, 0.0, 1.0, 0.0, 0.0]), (0,), radius=10.0)
         tensor([0.2000, 0.2000, 0.2000, 0.2000, 0.2000])
     """
+    if isinstance(radius, Tensor):
+        return _filter(values, axes, lambda size: _whole(*_gaussian(size, radius)))
     if not radius >= 0:
         raise InputError(f"radius={radius}: expected a share of the grid's edge, at least 0")
     if radius == 0:
         return values
-    return _filter(values, axes, lambda size: _gaussian(size, radius))
+    return _filter(values, axes, lambda size: _gaussian_factors(size, radius))
 
 
-@lru_cache(maxsize=16)
-def _basis(size: int, boundary: Boundary) -> tuple[Tensor, Tensor]:
-    """Orthonormal rows ``(size, size)`` and the number of the frequency of each, float64."""
-    nodes, rows = torch.arange(size, dtype=torch.float64), torch.arange(size, dtype=torch.float64)
+def _basis(size: int, boundary: Boundary) -> tuple[Tensor, Tensor, int]:
+    """Orthonormal rows ``(size, size)`` in float64, the number of the frequency of each, and the highest one."""
+    nodes = rows = torch.arange(size, dtype=torch.float64, device="cpu")
     if boundary == "mirror":
         basis = torch.cos(math.pi * rows[:, None] * (nodes + 0.5) / size)
-        frequencies = rows
-    else:
-        # Row 0 is constant; then a cosine and a sine of each frequency; an even size ends with a cosine.
-        frequencies = torch.div(rows + 1, 2, rounding_mode="floor")
-        angle = 2 * math.pi * frequencies[:, None] * nodes / size
-        basis = torch.where(rows[:, None] % 2 == 1, angle.cos(), angle.sin())
-        basis[0] = 1.0
-    return basis / basis.norm(dim=1, keepdim=True), frequencies
+        return basis / basis.norm(dim=1, keepdim=True), rows, size - 1
+    # Row 0 is constant; then a cosine and a sine of each frequency; an even size ends with a cosine.
+    frequencies = torch.div(rows + 1, 2, rounding_mode="floor")
+    angle = 2 * math.pi * frequencies[:, None] * nodes / size
+    basis = torch.where(
+        rows[:, None] % 2 == 1, angle.cos(), torch.where(rows[:, None] == 0, 1.0, angle.sin())
+    )
+    return basis / basis.norm(dim=1, keepdim=True), frequencies, size // 2
 
 
-@lru_cache(maxsize=16)
-def _low_pass(size: int, keep: float, boundary: Boundary) -> tuple[Tensor, ...]:
-    basis, frequencies = _basis(size, boundary)
-    return _factors(basis, low_pass_response(frequencies, int(frequencies[-1]), keep))
+def _low_pass(size: int, keep: float | Tensor, boundary: Boundary) -> tuple[Tensor, Tensor]:
+    """Basis and the factor of each of its rows."""
+    basis, frequencies, highest = _basis(size, boundary)
+    return basis, low_pass_response(frequencies, highest, keep)
 
 
-@lru_cache(maxsize=16)
-def _gaussian(size: int, radius: float) -> tuple[Tensor, ...]:
-    basis, frequencies = _basis(size, "mirror")
+def _gaussian(size: int, radius: float | Tensor) -> tuple[Tensor, Tensor]:
+    """Basis and the factor of each of its rows."""
+    basis, frequencies, _ = _basis(size, "mirror")
     angles = frequencies * (math.pi / size) * (radius * (size - 1))
-    return _factors(basis, torch.exp(-(angles**2) / 2))
+    return basis, torch.exp(-(angles**2) / 2)
+
+
+@lru_cache(maxsize=16)
+def _low_pass_factors(size: int, keep: float, boundary: Boundary) -> tuple[Tensor, ...]:
+    # A preview may ask first, in inference mode, for what training has to differentiate through.
+    with torch.inference_mode(False):
+        return _factors(*_low_pass(size, keep, boundary))
+
+
+@lru_cache(maxsize=16)
+def _gaussian_factors(size: int, radius: float) -> tuple[Tensor, ...]:
+    with torch.inference_mode(False):
+        return _factors(*_gaussian(size, radius))
 
 
 def _factors(basis: Tensor, response: Tensor) -> tuple[Tensor, ...]:
@@ -130,6 +147,11 @@ def _factors(basis: Tensor, response: Tensor) -> tuple[Tensor, ...]:
     passing = response > _NOTHING
     thin = basis[passing] * response[passing].sqrt()[:, None]
     return (thin.T @ thin,) if 2 * thin.shape[0] > thin.shape[1] else (thin, thin.T)
+
+
+def _whole(basis: Tensor, response: Tensor) -> tuple[Tensor, ...]:
+    """The filter as one matrix, whatever the response."""
+    return ((basis.T * response) @ basis,)
 
 
 def _filter(values: Tensor, axes: Sequence[int], factors_of: Callable[[int], tuple[Tensor, ...]]) -> Tensor:

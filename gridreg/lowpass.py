@@ -74,6 +74,12 @@ class _GridFilter(Regularizer):
         return self.number(context)
 
 
+def _number(context: Context) -> float | Tensor:
+    """The number of this step; while compiling as a tensor, so that the next step needs no new code."""
+    number = context.state["number"]
+    return number if torch.compiler.is_compiling() else float(number)
+
+
 def _filtered(
     value: Tensor, context: Context, function: Callable[[Tensor, tuple[int, ...]], Tensor]
 ) -> Tensor:
@@ -135,7 +141,7 @@ class FourierLowPass(_GridFilter):
 
     def transform(self, value: Tensor, context: Context) -> Tensor:
         """The grid without its high frequencies."""
-        keep = float(context.state["number"])
+        keep = _number(context)
         return _filtered(value, context, lambda v, axes: fourier_low_pass(v, axes, keep, self.boundary))
 
     @classmethod
@@ -201,7 +207,7 @@ class SpatialAnnealing(_GridFilter):
 
     def transform(self, value: Tensor, context: Context) -> Tensor:
         """The blurred grid."""
-        radius = float(context.state["number"])
+        radius = _number(context)
         return _filtered(value, context, lambda v, axes: gaussian_blur(v, axes, radius))
 
     @classmethod

@@ -90,6 +90,14 @@ class TestFourierLowPass:
         assert (spectrum[:5] > 1e-6).all()
         np.testing.assert_allclose(spectrum[5:], 0, atol=1e-9)
 
+    def test_a_tensor_for_the_share_gives_the_same(self) -> None:
+        values = random(9, 8, 2)
+        for keep in (0.0, 0.3, 0.8, 1.0):
+            found = fourier_low_pass(values, (0, 1), torch.tensor(keep, dtype=torch.float64))
+            torch.testing.assert_close(found, fourier_low_pass(values, (0, 1), keep))
+            found = gaussian_blur(values, (0, 1), torch.tensor(keep, dtype=torch.float64))
+            torch.testing.assert_close(found, gaussian_blur(values, (0, 1), keep), atol=1e-6, rtol=0)
+
     def test_response_never_falls_with_the_share(self) -> None:
         frequencies = torch.arange(11)
         responses = torch.stack([low_pass_response(frequencies, 10, k / 30) for k in range(31)])
@@ -143,6 +151,18 @@ class TestGaussianBlur:
         for radius in (-1.0, float("nan")):
             with pytest.raises(InputError, match="radius="):
                 gaussian_blur(values, (0,), radius)
+
+
+def test_constants_made_in_inference_mode_serve_training_too() -> None:
+    values = random(13, 3)
+    with torch.inference_mode():
+        previews = fourier_low_pass(values, (0,), 0.37), gaussian_blur(values, (0,), 0.123)
+    values.requires_grad_()
+    trained = fourier_low_pass(values, (0,), 0.37), gaussian_blur(values, (0,), 0.123)
+    for preview, result in zip(previews, trained, strict=True):
+        assert torch.equal(preview, result.detach())
+        (gradient,) = torch.autograd.grad(result.square().sum(), values)
+        assert torch.isfinite(gradient).all()
 
 
 class TestAnnealedRadius:
@@ -211,6 +231,16 @@ class TestAttached:
         assert torch.equal(after[..., 1], before[..., 1])
         expected = fourier_low_pass(before[..., [0, 2]], (0, 1), 0.25)
         torch.testing.assert_close(after[..., [0, 2]], expected)
+
+    def test_a_compiled_field_follows_the_step(self) -> None:
+        field = Planes(8)
+        handle = gridreg.apply(
+            field, FourierLowPass(PLANES, Linear(0.1, 1.0)), SpatialAnnealing(LINES, until=4), total_steps=10
+        )
+        compiled = torch.compile(field, backend="eager")
+        for step in (0, 2, 5):
+            handle.step(step)
+            torch.testing.assert_close(compiled(), field())
 
     def test_values_for_tables(self) -> None:
         field = Planes(8)
