@@ -102,7 +102,7 @@ def gaussian_blur(values: Tensor, axes: Sequence[int], radius: float | Tensor) -
 
 
 def _basis(size: int, boundary: Boundary) -> tuple[Tensor, Tensor, int]:
-    """Orthonormal rows ``(size, size)`` in float64, the number of the frequency of each, and the highest one."""
+    """Orthonormal rows ``(size, size)``, the number of the frequency of each, and the highest number."""
     nodes = rows = torch.arange(size, dtype=torch.float64, device="cpu")
     if boundary == "mirror":
         basis = torch.cos(math.pi * rows[:, None] * (nodes + 0.5) / size)
