@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import fnmatch
+import inspect
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Literal, TypeAlias
@@ -32,9 +33,9 @@ def _declared_by(module: nn.Module) -> dict[str, Site]:
     """Sites that a module declares by itself or through adapters."""
     found: dict[str, Site | Selector] = {}
     declare = getattr(module, "sites", None)
-    if callable(declare):
+    # Somebody else's method, attribute or submodule of that name is not a declaration.
+    if inspect.ismethod(declare) and not inspect.signature(declare).parameters:
         declared = declare()
-        # Somebody else's method of that name is not a declaration.
         if isinstance(declared, Mapping) and all(isinstance(s, (Site, Selector)) for s in declared.values()):
             found.update(declared)
     for cls in reversed(type(module).__mro__):

@@ -74,7 +74,7 @@ def end_step(until: Numeric, step: int, total_steps: int) -> int:
         raise InputError(
             f"until={fraction}: a float is a fraction of total_steps in (0, 1]; write a step as an int"
         )
-    # 0.9 * 15000 is 13500.000000000002: without rounding, step 13500 would still count as before the end.
+    # 0.07 * 100 is 7.000000000000001: without rounding, step 7 would still count as before the end.
     return max(1, math.ceil(round(fraction * total_steps, 6)))
 
 
