@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from gridreg.encodings import octaves_of_channels, positional_encoding
+from backbones import kernels
+from backbones.kernels.linear import Precision
+from gridreg.encodings import octaves_of_channels
 from gridreg.sites import Site, inputs, parameters
 
 __all__ = ["DECODERS", "MLPDecoder", "RGBDecoder", "SHDecoder", "make_decoder"]
@@ -26,7 +30,10 @@ class MLPDecoder(nn.Module):
         feature_octaves, direction_octaves: octaves of the encodings (2 and 2 for ``MLP_Fea``).
         position_octaves: octaves of the position's encoding; None leaves the position out.
         width: hidden width.
+        precision: of the matrix products on the CPU, see `backbones.kernels.mlp`.
     """
+
+    layers: nn.ModuleList
 
     def __init__(
         self,
@@ -36,9 +43,11 @@ class MLPDecoder(nn.Module):
         direction_octaves: int = 2,
         position_octaves: int | None = None,
         width: int = 128,
+        precision: Precision = "auto",
     ) -> None:
         super().__init__()
         self.features = features
+        self.precision = precision
         self.feature_octaves = feature_octaves
         self.direction_octaves = direction_octaves
         self.position_octaves = position_octaves
@@ -51,7 +60,11 @@ class MLPDecoder(nn.Module):
     def block_sizes(self) -> tuple[int, int, int]:
         """Input columns of features, direction and position."""
         position = 0 if self.position_octaves is None else 3 * (1 + 2 * self.position_octaves)
-        return (self.features * (1 + 2 * self.feature_octaves), 3 * (1 + 2 * self.direction_octaves), position)
+        return (
+            self.features * (1 + 2 * self.feature_octaves),
+            3 * (1 + 2 * self.direction_octaves),
+            position,
+        )
 
     def forward(
         self, features: Tensor, directions: Tensor, positions: Tensor, ray_indices: Tensor | None = None
@@ -64,31 +77,38 @@ class MLPDecoder(nn.Module):
             positions: ``(N, 3)`` normalised to [-1, 1].
             ray_indices: ``(N,)``: the ray of each sample; its direction is then encoded once per ray.
         """
-        first, second, last = self.layers
+        first, second, last = (cast(nn.Linear, layer) for layer in self.layers)
         weight = first.weight
         of_features, of_direction, _ = self.block_sizes
-        encoded = positional_encoding(features, self.feature_octaves)
+        blocks = [(features, self.feature_octaves)]
+        columns = weight[:, :of_features]
         if self.position_octaves is not None:
-            encoded = torch.cat([encoded, positional_encoding(positions, self.position_octaves)], dim=-1)
-            columns = torch.cat([weight[:, :of_features], weight[:, of_features + of_direction :]], dim=-1)
-        else:
-            columns = weight[:, :of_features]
+            blocks.append((positions, self.position_octaves))
+            columns = torch.cat([columns, weight[:, of_features + of_direction :]], dim=-1)
         by_direction = F.linear(
-            positional_encoding(directions, self.direction_octaves),
+            kernels.encode(directions, self.direction_octaves),
             weight[:, of_features : of_features + of_direction],
-            first.bias,  # type: ignore[arg-type]
+            first.bias,
         )
-        if ray_indices is not None:
-            by_direction = by_direction[ray_indices]
-        hidden = torch.relu(F.linear(encoded, columns) + by_direction)
-        return torch.sigmoid(last(torch.relu(second(hidden))))  # type: ignore[no-any-return]
+        out = kernels.mlp(
+            kernels.encode_together(blocks),
+            [(columns, None), (second.weight, second.bias), (last.weight, last.bias)],
+            offset=by_direction,
+            rows=ray_indices,
+            precision=self.precision,
+        )
+        return torch.sigmoid(out)
 
     def sites(self, prefix: str) -> dict[str, Site]:
         """The encodings' sites: columns of the first weight, each with its octave."""
         found, start = {}, 0
         octaves = (self.feature_octaves, self.direction_octaves, self.position_octaves or 0)
         for name, size, width, count in zip(
-            ("features", "direction", "position"), self.block_sizes, (self.features, 3, 3), octaves, strict=True
+            ("features", "direction", "position"),
+            self.block_sizes,
+            (self.features, 3, 3),
+            octaves,
+            strict=True,
         ):
             if size:
                 selector = parameters(
@@ -167,38 +187,37 @@ def spherical_harmonics(directions: Tensor) -> Tensor:
     )
 
 
-def _mlp(feature: int, direction: int, position: int | None) -> Callable[[int, int], nn.Module]:
-    def make(features: int, width: int) -> nn.Module:
-        return MLPDecoder(
-            features, feature_octaves=feature, direction_octaves=direction, position_octaves=position, width=width
-        )
-
-    return make
+def _mlp(feature: int, direction: int, position: int | None) -> Callable[..., nn.Module]:
+    return functools.partial(
+        MLPDecoder, feature_octaves=feature, direction_octaves=direction, position_octaves=position
+    )
 
 
-#: Decoders by name: (default features, constructor from features and width).
-DECODERS: dict[str, tuple[int, Callable[[int, int], nn.Module]]] = {
+#: Decoders by name: default features, and constructor.
+DECODERS: dict[str, tuple[int, Callable[..., nn.Module]]] = {
     "mlp_fea": (27, _mlp(2, 2, None)),
     "mlp_pe": (27, _mlp(0, 2, 6)),
     "mlp": (27, _mlp(2, 6, 6)),
-    "sh": (27, lambda features, width: SHDecoder(features)),
-    "rgb": (3, lambda features, width: RGBDecoder(features)),
+    "sh": (27, SHDecoder),
+    "rgb": (3, RGBDecoder),
 }
 
 
-def make_decoder(name: str, features: int | None = None, width: int = 128) -> tuple[int, nn.Module]:
+def make_decoder(name: str, features: int | None = None, **options: Any) -> tuple[int, nn.Module]:
     """A decoder by name, and the number of features it reads.
 
     Args:
-        name: ``mlp_fea`` (TensoRF MLP_Fea), ``mlp_pe`` (MLP_PE), ``mlp`` (Few TensoRF: position 6, direction 6, feature 2
-            octaves), ``sh`` or ``rgb``.
+        name: ``mlp_fea`` (TensoRF MLP_Fea), ``mlp_pe`` (MLP_PE), ``mlp`` (Few TensoRF: position 6, direction 6,
+            feature 2 octaves), ``sh`` or ``rgb``.
+        features: that it reads; None: its own default.
+        options: of its constructor, such as ``width`` and ``precision`` of the MLPs.
 
     Raises:
         ValueError: for an unknown name.
+        TypeError: for an option that the decoder does not have.
     """
     if name not in DECODERS:
         raise ValueError(f"decoder={name!r}: unknown; expected one of {', '.join(sorted(DECODERS))}")
     default, make = DECODERS[name]
     count = default if features is None else features
-    return count, make(count, width)
-
+    return count, make(count, **options)

@@ -21,8 +21,8 @@ __all__ = ["TensorialField", "density_shift_for"]
 def density_shift_for(opacity: float, length: float, distance_scale: float) -> float:
     """The shift at which a ray through an untrained field has a wanted opacity.
 
-    With features near 0, ``distance_scale * softplus(shift)`` must be ``-log(1 - opacity) / length``. DVGO (section 4.1)
-    derives its shift from the opacity of a step; the opacity of a ray does not depend on the step.
+    With features near 0, ``distance_scale * softplus(shift)`` must be ``-log(1 - opacity) / length``. DVGO (section
+    4.1) derives its shift from the opacity of a step; the opacity of a ray does not depend on the step.
 
     Args:
         opacity: in (0, 1).
@@ -53,6 +53,7 @@ class TensorialField(nn.Module):
         density_shift: added before the softplus; -10 in TensoRF. None: from ``initial_opacity``.
         initial_opacity: opacity of a ray along the mean edge of the box before training; used when there is no shift.
         distance_scale: factor on the density (25 in TensoRF).
+        decoder_options: of the decoder, such as ``width`` (128) and ``precision`` ("auto") of the MLPs.
     """
 
     bounds: Tensor
@@ -65,19 +66,21 @@ class TensorialField(nn.Module):
         *,
         decoder: str = "mlp_fea",
         features: int | None = None,
-        width: int = 128,
         density_shift: float | None = -10.0,
         initial_opacity: float = 0.1,
         distance_scale: float = 25.0,
+        **decoder_options: Any,
     ) -> None:
         super().__init__()
         if tuple(bounds.shape) != (2, 3) or not bool((bounds[1] > bounds[0]).all()):
-            raise ValueError(f"bounds={bounds.tolist()}: expected a lower and a larger upper corner, shape (2, 3)")
+            raise ValueError(
+                f"bounds={bounds.tolist()}: expected a lower and a larger upper corner, shape (2, 3)"
+            )
         if min(resolution) < 2:
             raise ValueError(f"resolution={resolution}: expected at least 2 nodes along every axis")
         self.register_buffer("bounds", bounds.clone().float())
         self.resolution = resolution
-        count, self.decoder = make_decoder(decoder, features, width)
+        count, self.decoder = make_decoder(decoder, features, **decoder_options)
         self.basis = nn.Linear(appearance_channels, count, bias=False)
         self.distance_scale = distance_scale
         if density_shift is None:
@@ -165,7 +168,9 @@ class TensorialField(nn.Module):
             {"name": "network", "params": self.network_parameters()},
         ]
 
-    def make_optimizer(self, groups: list[dict[str, Any]], betas: tuple[float, float]) -> torch.optim.Optimizer:
+    def make_optimizer(
+        self, groups: list[dict[str, Any]], betas: tuple[float, float]
+    ) -> torch.optim.Optimizer:
         """Adam that folds grid penalties into its one pass over memory.
 
         Args:

@@ -47,7 +47,9 @@ class VMField(TensorialField):
     ) -> None:
         super().__init__(bounds, resolution, 3 * appearance_components, **options)
         self.density_planes, self.density_lines = _grids(resolution, density_components, scale, generator)
-        self.appearance_planes, self.appearance_lines = _grids(resolution, appearance_components, scale, generator)
+        self.appearance_planes, self.appearance_lines = _grids(
+            resolution, appearance_components, scale, generator
+        )
 
     def density_features(self, u: Tensor) -> Tensor:
         """``G(x)``: normalised positions ``(N, 3)`` to ``(N,)``."""
@@ -58,7 +60,10 @@ class VMField(TensorialField):
     def appearance_features(self, u: Tensor) -> Tensor:
         """Normalised positions ``(N, 3)`` to the concatenated products ``(N, 3 C)``."""
         return kernels.vm_features(
-            u, list(self.appearance_planes), list(self.appearance_lines), open_channels(self.appearance_lines, "0")
+            u,
+            list(self.appearance_planes),
+            list(self.appearance_lines),
+            open_channels(self.appearance_lines, "0"),
         )
 
     @torch.no_grad()
@@ -100,7 +105,9 @@ def _grids(
 ) -> tuple[nn.ParameterList, nn.ParameterList]:
     planes, lines = nn.ParameterList(), nn.ParameterList()
     for (a, b), v in zip(PLANE_AXES, LINE_AXES, strict=True):
-        planes.append(nn.Parameter(scale * torch.randn(resolution[a], resolution[b], channels, generator=generator)))
+        planes.append(
+            nn.Parameter(scale * torch.randn(resolution[a], resolution[b], channels, generator=generator))
+        )
         lines.append(nn.Parameter(scale * torch.randn(resolution[v], channels, generator=generator)))
     return planes, lines
 

@@ -1,7 +1,7 @@
 """Few TensoRF (TensoRF + frequency masks + occlusion loss) on a scene in Blender format, or on the built-in one.
 
-    python examples/few_tensorf_blender.py
-    python examples/few_tensorf_blender.py --scene DIR --protocol dietnerf8 --preset few_tensorf --out DIR
+python examples/few_tensorf_blender.py
+python examples/few_tensorf_blender.py --scene DIR --protocol dietnerf8 --preset few_tensorf --out DIR
 """
 
 from __future__ import annotations
@@ -21,7 +21,11 @@ def draw(run: Execution, options: TrainOptions) -> None:
     trainer, scene = run.trainer, run.scene
     model = Model(trainer.field, trainer.occupancy, trainer.march, scene.background)
     if options.mesh:
-        write_mesh(trainer.field, run.out / "mesh.ply", trainer.occupancy)
+        try:
+            write_mesh(trainer.field, run.out / "mesh.ply", trainer.occupancy)
+        except InputError as error:
+            # A field without a surface (a very short run) is scored all the same.
+            print(f"no mesh: {error}", file=sys.stderr)
     if options.video:
         cameras = camera_path("turntable", trainer.field.bounds, scene.train, frames=60, width=200)
         render_video(model, run.out / "turntable.mp4", cameras)
@@ -32,7 +36,9 @@ def main(options: TrainOptions) -> int:
     config = configure(options)
     out = output_folder(options, config)
     scene = open_scene(config, cache=Path("outputs"))
-    print(f"{scene.name}, {scene.protocol}: {len(scene.train)} training views; results go to {out}", flush=True)
+    print(
+        f"{scene.name}, {scene.protocol}: {len(scene.train)} training views; results go to {out}", flush=True
+    )
     run, metrics = execute(config, scene, out, resume=options.resume, command=sys.argv)
     if metrics is None:
         return 130

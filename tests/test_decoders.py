@@ -25,7 +25,9 @@ def test_the_first_layer_is_as_wide_as_published(name, columns):
 
 
 def test_a_decoder_equals_the_mlp_written_out():
-    decoder = MLPDecoder(4, feature_octaves=1, direction_octaves=2, position_octaves=3, width=8)
+    decoder = MLPDecoder(
+        4, feature_octaves=1, direction_octaves=2, position_octaves=3, width=8, precision="float32"
+    )
     f, d, x = torch.randn(9, 4), normalize(torch.randn(9, 3), dim=-1), torch.rand(9, 3) * 2 - 1
 
     def encode(value, octaves):

@@ -16,6 +16,8 @@ LETTERS = "xyz"
 def small(resolution=(5, 6, 7), seed=0, **options):
     generator = torch.Generator().manual_seed(seed)
     settings = {"density_components": 3, "appearance_components": 2, "generator": generator, "scale": 1.0}
+    if options.get("decoder", "mlp").startswith("mlp"):
+        settings["precision"] = "float32"
     return VMField(BOX, resolution, **{**settings, **options})
 
 
@@ -145,7 +147,9 @@ def test_colour_by_ray_is_colour_by_sample():
         x = BOX[0] + torch.rand(20, 3) * (BOX[1] - BOX[0])
         directions = torch.nn.functional.normalize(torch.randn(4, 3), dim=-1)
         rays = torch.randint(4, (20,))
-        torch.testing.assert_close(field.colour_of_rays(x, directions, rays), field.colour(x, directions[rays]))
+        torch.testing.assert_close(
+            field.colour_of_rays(x, directions, rays), field.colour(x, directions[rays])
+        )
 
 
 def test_parameter_groups_hold_every_parameter_once():

@@ -72,7 +72,7 @@ class OccupancyGrid:
         occupied = self.cells.reshape(-1).nonzero().squeeze(-1)
         bound = -math.log1p(-threshold) / step
         kept = torch.zeros(self.cells.numel(), dtype=torch.uint8, device=self.cells.device)
-        for part in occupied.split(chunk):
+        for part in torch.split(occupied, chunk):
             kept[part] = (density(self.centres(part)) > bound).to(torch.uint8)
         grown = _dilate(kept.reshape(self.cells.shape), dilate)
         self.cells = grown if self.hull is None else grown * self.hull
@@ -157,12 +157,18 @@ def _alpha_views(alpha: Tensor, poses: Tensor, intrinsics: Tensor) -> Iterator[t
 
 @torch.no_grad()
 def visual_hull(
-    grid: OccupancyGrid, alpha: Tensor, poses: Tensor, intrinsics: Tensor, *, margin: float = 1.0, chunk: int = 1 << 18
+    grid: OccupancyGrid,
+    alpha: Tensor,
+    poses: Tensor,
+    intrinsics: Tensor,
+    *,
+    margin: float = 1.0,
+    chunk: int = 1 << 18,
 ) -> Tensor:
     """Cells that no view proves empty: space carving from silhouettes (Laurentini 1994).
 
-    A cell is carved when its whole projection, plus a margin, falls on pixels with alpha 0 in some view. What a view does
-    not see (outside the picture, behind the camera) it does not carve.
+    A cell is carved when its whole projection, plus a margin, falls on pixels with alpha 0 in some view. What a view
+    does not see (outside the picture, behind the camera) it does not carve.
 
     Args:
         grid: box and resolution.
@@ -180,12 +186,15 @@ def visual_hull(
     kept = torch.arange(grid.cells.numel(), device=alpha.device)
     for total, world_to_camera, (fx, fy, cx, cy) in _alpha_views(alpha, poses, intrinsics):
         survivors = []
-        for part in kept.split(chunk):
+        for part in torch.split(kept, chunk):
             local = grid.centres(part).double() @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
             depth = -local[:, 2]
             safe = (depth - radius).clamp(min=1e-6)
             column, row = cx + fx * local[:, 0] / depth, cy - fy * local[:, 1] / depth
-            pixels = radius * torch.maximum(fx, fy) * (1 + (local[:, :2] / safe[:, None]).norm(dim=-1)) / safe + margin
+            pixels = (
+                radius * torch.maximum(fx, fy) * (1 + (local[:, :2] / safe[:, None]).norm(dim=-1)) / safe
+                + margin
+            )
             seen_whole = (
                 (depth > radius)
                 & (column - pixels >= 0)

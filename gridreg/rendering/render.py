@@ -75,7 +75,12 @@ class Rendered:
 
 
 def _march(
-    field: Any, rays: Rays, t_range: tuple[Tensor, Tensor], occupancy: OccupancyGrid, march: March, jitter: Tensor
+    field: Any,
+    rays: Rays,
+    t_range: tuple[Tensor, Tensor],
+    occupancy: OccupancyGrid,
+    march: March,
+    jitter: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Offsets, index, t, positions and density of the samples that are not hidden."""
     t_min, t_max = t_range
@@ -162,7 +167,9 @@ def render_rays(
 
 
 def composite(samples: RaySamples) -> Rendered:
-    """Pixels from samples: ``sum w c + (1 - sum w) background``."""
+    """Pixels from samples with colours and background: ``sum w c + (1 - sum w) background``."""
+    if samples.colours is None or samples.background is None:
+        raise ValueError("samples: found no colours or no background, expected both for compositing")
     stacked = torch.cat([samples.colours, samples.t[:, None], torch.ones_like(samples.t[:, None])], dim=-1)
     total = backends.accumulate(samples.weights, stacked, samples.offsets)
     opacity = total[:, 4]

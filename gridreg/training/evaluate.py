@@ -69,7 +69,11 @@ def mean_psnr_of(
     """Mean PSNR (dB) over every ``stride``-th view, for a look on the way."""
     chosen = slice(None, None, stride)
     some = Views(
-        views.rgba[chosen], views.poses[chosen], views.intrinsics[chosen], views.names[chosen], views.ids[chosen]
+        views.rgba[chosen],
+        views.poses[chosen],
+        views.intrinsics[chosen],
+        views.names[chosen],
+        views.ids[chosen],
     )
     targets = some.composited(background)
     pictures = render_views(field, some, occupancy, march, background)

@@ -203,7 +203,9 @@ def execute(
     folder = check_output_folder(out)
     checkpoint = folder / "checkpoint"
     if has_checkpoint(checkpoint) and not resume:
-        raise InputError(f"{folder}: holds a run already; resume it with --resume, or choose another output folder")
+        raise InputError(
+            f"{folder}: holds a run already; resume it with --resume, or choose another output folder"
+        )
     began = time.perf_counter()
     if resume:
         trainer, record = resume_trainer(checkpoint, config, scene)
@@ -213,7 +215,9 @@ def execute(
         trainer, history, times = build_trainer(config, scene), History(max(1, config.train.steps // 200)), {}
     times["setup"] = times.get("setup", 0.0) + time.perf_counter() - began
     run = Execution(config, scene, folder, trainer, history, times)
-    save_yaml(folder / "config.yaml", config, comment="Everything that determines this run; pass it with --config.")
+    save_yaml(
+        folder / "config.yaml", config, comment="Everything that determines this run; pass it with --config."
+    )
     with interruptible() as interruption:
         with Progress(config.train.steps, start=trainer.step) as progress:
             finished = run.train(progress, interruption, on_step)

@@ -42,9 +42,8 @@ class RayBank:
 
     def restrict(self, useful: Callable[[Rays], Tensor], chunk: int = 1 << 15) -> None:
         """Keep the active pixels whose ray is useful, and all that are not transparent."""
-        kept = [
-            part[useful(self.rays(part)) | (self.pixels[part, 3] > 0)] for part in self.active.split(chunk)
-        ]
+        parts = torch.split(self.active, chunk)
+        kept = [part[useful(self.rays(part)) | (self.pixels[part, 3] > 0)] for part in parts]
         self.active = torch.cat(kept)
 
 

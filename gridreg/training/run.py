@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,12 +15,20 @@ from gridreg.fields import make_field
 from gridreg.rendering import March, OccupancyGrid
 from gridreg.scenes import Scene, builtin_scene, load_scene
 from gridreg.training import events
-from gridreg.training.checkpoint import load_checkpoint, save_checkpoint
+from gridreg.training.checkpoint import has_checkpoint, load_checkpoint, save_checkpoint
 from gridreg.training.config import from_data, to_data
 from gridreg.training.settings import RunConfig
 from gridreg.training.trainer import Trainer, load_field
 
-__all__ = ["LoadedRun", "build_trainer", "load_run", "open_scene", "regularizers_of", "resume_trainer", "save_run"]
+__all__ = [
+    "LoadedRun",
+    "build_trainer",
+    "load_run",
+    "open_scene",
+    "regularizers_of",
+    "resume_trainer",
+    "save_run",
+]
 
 
 def open_scene(config: RunConfig, cache: Path, validation: int | None = None) -> Scene:
@@ -120,7 +127,7 @@ def load_run(folder: str | Path) -> LoadedRun:
         InputError: if there is none, or it is damaged.
     """
     path = Path(folder)
-    path = path / "checkpoint" if (path / "checkpoint").exists() else path
+    path = path / "checkpoint" if has_checkpoint(path / "checkpoint") else path
     saved = load_checkpoint(path)
     config = from_data(RunConfig, saved.config, source=str(path))
     state = saved.state["trainer"]
@@ -139,5 +146,10 @@ def load_run(folder: str | Path) -> LoadedRun:
         weight_bound=config.train.weight_bound,
     )
     return LoadedRun(
-        field, OccupancyGrid(**state["occupancy"]), march, saved.state["background"], config, int(state["step"])
+        field,
+        OccupancyGrid(**state["occupancy"]),
+        march,
+        saved.state["background"],
+        config,
+        int(state["step"]),
     )

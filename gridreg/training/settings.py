@@ -28,7 +28,7 @@ class TrainSettings:
         occupancy_every: also every so many iterations after the first of those; 0: never.
         occupancy_resolution: largest number of occupancy cells along an axis.
         occupancy_threshold: opacity over one step below which a cell is empty.
-        shrink_at: iterations at which the box shrinks to the occupied cells; a subset of ``occupancy_at``, or 0 with ``carve``.
+        shrink_at: iterations at which the box shrinks to the occupied cells; a subset of ``occupancy_at``.
         filter_rays_at: iterations from which rays that meet no occupied cell are not drawn any more.
         carve: start from the visual hull of the training views' alpha.
         step_ratio: ray step in cells.
@@ -69,7 +69,7 @@ class TrainSettings:
             value = getattr(self, name)
             if not (value > 0 and math.isfinite(value)):
                 raise InputError(f"train.{name}: found {value}, expected a positive number")
-        stray = [s for s in self.shrink_at if s not in self.occupancy_at and not (s == 0 and self.carve)]
+        stray = [s for s in self.shrink_at if s not in self.occupancy_at]
         if stray:
             raise InputError(
                 f"train.shrink_at: found {stray[0]}, which is not in occupancy_at {self.occupancy_at}; "

@@ -39,7 +39,13 @@ class Trainer:
     """
 
     def __init__(
-        self, field: Any, scene: Scene, composition: list[Regularizer], settings: TrainSettings, *, seed: int = 0
+        self,
+        field: Any,
+        scene: Scene,
+        composition: list[Regularizer],
+        settings: TrainSettings,
+        *,
+        seed: int = 0,
     ) -> None:
         self.field, self.scene, self.settings = field, scene, settings
         self.generator = torch.Generator().manual_seed(seed)
@@ -97,7 +103,8 @@ class Trainer:
         rays, rgba = self.bank.draw(self.settings.rays, self.generator)
         jitter = torch.rand(len(rays), generator=self.generator)
         default = self.scene.background.to(rgba)
-        background = self.handle.background(len(rays), self.generator, default.expand(len(rays), 3))
+        background = self.handle.background(len(rays), self.generator, default)
+        background = (default if background is None else background).expand(len(rays), 3)
         target = rgba[:, :3] * rgba[:, 3:] + (1 - rgba[:, 3:]) * background
         march = self.march
         ones = torch.ones_like(jitter)
@@ -127,7 +134,9 @@ class Trainer:
         loss = mse + self.handle.loss(rendered.samples, exclude={term.name for term in folded})
         value = loss.item()
         if not math.isfinite(value):
-            raise InputError(f"step {self.step}: the loss is {value}; a lower learning rate or penalty weight may help")
+            raise InputError(
+                f"step {self.step}: the loss is {value}; a lower learning rate or penalty weight may help"
+            )
         if not getattr(self.optimizer, "zeroes_gradients", False):
             self.optimizer.zero_grad(set_to_none=True)
         if loss.requires_grad:
@@ -136,7 +145,8 @@ class Trainer:
         report = StepReport(loss=value, mse=mse.item(), psnr=-10 * math.log10(max(mse.item(), 1e-12)))
         report.update({name: float(term) for name, term in self.handle.terms.items()})
         if folded:
-            report.update(self.optimizer.step(local_terms=folded))  # type: ignore[arg-type, call-arg]
+            values: dict[str, float] = self.optimizer.step(local_terms=folded)  # type: ignore[call-overload]
+            report.update(values)
         else:
             self.optimizer.step()
         self.step += 1
@@ -190,5 +200,3 @@ def load_field(field: nn.Module, state: dict[str, Any], handle: Any = None) -> N
             with handle.suspended():
                 field.resample(tuple(state["resolution"]))  # type: ignore[operator]
     field.load_state_dict(state["field"])
-
-
