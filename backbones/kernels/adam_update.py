@@ -100,7 +100,8 @@ def _flat(table: Any) -> None:
             sums[task, 3] += size_sum
             sums[task, 4] += square_sum
             if slope_sum != _ZERO:
-                g[first:last] = _ZERO
+                for i in range(first, last):
+                    g[i] = _ZERO
 
 
 @inline
@@ -175,7 +176,8 @@ def _grid_piece(
         sums[3] += c4
         sums[4] += c5
         if c0 != _ZERO:
-            g[at + first : at + last] = _ZERO
+            for i in range(at + first, at + last):
+                g[i] = _ZERO
 
 
 @kernel
@@ -215,7 +217,9 @@ def _grid(table: Any) -> None:
         # Of inner boundaries only, so one slab less than there are blocks.
         edge = (outer * (blocks - 1) + number) * slab
         at = (outer * slabs + first) * slab
-        kept[:] = before[edge - slab : edge] if number > 0 else p[at : at + slab]
+        # A loop, as the error that assigning a slice may raise takes seconds to compile.
+        for i in range(slab):
+            kept[i] = before[edge - slab + i] if number > 0 else p[at + i]
         for a in range(first, last):
             at = (outer * slabs + a) * slab
             for r in range(rows):

@@ -50,7 +50,8 @@ def _coarsen(table: Any) -> None:
             break
         column = columns[a]
         for b in range(coarse.shape[1]):
-            column[:] = 0
+            for k in range(nz):
+                column[k] = 0
             for i in range(a * _COARSE, min(nx, (a + 1) * _COARSE)):
                 for j in range(b * _COARSE, min(ny, (b + 1) * _COARSE)):
                     row = cells[i, j]
