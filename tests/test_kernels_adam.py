@@ -110,7 +110,7 @@ terms_lists = st.lists(
 
 
 class TestAgainstTorch:
-    @settings(max_examples=50, deadline=None)
+    @settings(max_examples=30, deadline=None)
     @given(
         shape=st.tuples(st.integers(2, 60), st.integers(2, 9), st.sampled_from([1, 2, 3, 8, 11, 16, 48])),
         kinds=terms_lists,
