@@ -50,10 +50,12 @@ class Row:
         return [match.grid() for match in self.matches]
 
     def value(self) -> float:
-        """One number for tables and curves: the mean over its tensors."""
-        sized = [slot.context for _, slot in self.slots if slot.context.place and slot.context.place.size]
-        values = [self.regularizer.value(context) for context in sized or [self.context]]
-        return sum(values) / len(values)
+        """One number for tables and curves: the mean over its tensors; NaN until one has shown its width."""
+        if not self.slots:
+            return self.regularizer.value(self.context)
+        sized = [slot.context for match, slot in self.slots if match.place.size is not None]
+        values = [self.regularizer.value(context) for context in sized]
+        return sum(values) / len(values) if values else float("nan")
 
 
 class Attachment:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, is_dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar
 
 import torch
@@ -225,7 +225,8 @@ def register(cls: RegularizerClass) -> RegularizerClass:
     Raises:
         InputError: not a frozen dataclass, or it does not override `examples`.
     """
-    if not is_dataclass(cls) or not cls.__dataclass_params__.frozen:  # type: ignore[attr-defined]
+    # Of its own: the base class is a dataclass too, so `is_dataclass` would say yes to any subclass.
+    if "__dataclass_params__" not in vars(cls) or not cls.__dataclass_params__.frozen:  # type: ignore[attr-defined]
         raise InputError(
             f"{cls.__name__}: a regularizer is a frozen dataclass; put @dataclass(frozen=True) below"
         )

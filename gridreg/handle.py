@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
@@ -288,4 +289,5 @@ def _cells(row: Row) -> tuple[str, str, str, str]:
     sizes = [match.place.channels for match, _ in row.slots]
     counts = sorted({"?" if size is None else str(size) for size in sizes})
     channels = (f"{len(sizes)} x " if len(sizes) > 1 else "") + ", ".join(counts)
-    return type(row.regularizer).__name__, row.label or "samples", channels or "-", f"{row.value():.4g}"
+    value = "?" if math.isnan(row.value()) else f"{row.value():.4g}"
+    return type(row.regularizer).__name__, row.label or "samples", channels or "-", value
