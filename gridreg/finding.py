@@ -196,10 +196,19 @@ def _checked_dim(name: str, tensor: Tensor, selector: Selector) -> int:
 
 
 def _check_sizes(tensors: Mapping[str, Tensor], dims: Mapping[str, int], selector: Selector) -> None:
-    """Refuse matches of unequal length along `dim`, a sign that the axis is spatial."""
-    sizes = {name: tensor.shape[dims[name]] for name, tensor in tensors.items()}
-    if len(set(sizes.values())) > 1 and selector.spatial is None:
-        listed = ", ".join(f"{name} {size}" for name, size in list(sizes.items())[:6])
+    """Refuse matches of unequal length along `dim`, a sign that the axis is spatial.
+
+    Not where the layout is plain: axis 1 of `[1, C, ...]`, as `grid_sample` takes it, is the channel axis.
+    """
+    if selector.spatial is not None:
+        return
+    doubtful = {
+        name: tensor.shape[dims[name]]
+        for name, tensor in tensors.items()
+        if not (tensor.ndim in (4, 5) and tensor.shape[0] == 1 and dims[name] == 1)
+    }
+    if len(set(doubtful.values())) > 1:
+        listed = ", ".join(f"{name} {size}" for name, size in list(doubtful.items())[:6])
         raise InputError(
             f"dim={selector.dim} of {selector}: lengths differ ({listed}), so this axis looks spatial; "
             "name the channel axis, or, if it is one, the spatial axes with spatial=..."

@@ -176,9 +176,14 @@ def test_bad_selectors_are_refused_when_made(make: Any, text: str) -> None:
         make()
 
 
-def test_explicit_spatial_axes_allow_unequal_channel_counts() -> None:
-    field = nn.ParameterList(nn.Parameter(torch.zeros(1, channels, 9, 1)) for channels in (16, 4, 4))
-    matches = find(field, gridreg.parameters("*", dim=1, spatial=(2,)), "mask")
+def test_unequal_channel_counts_need_a_plain_layout_or_explicit_spatial_axes() -> None:
+    plain = nn.ParameterList(nn.Parameter(torch.zeros(1, channels, 9, 1)) for channels in (16, 4, 4))
+    matches = find(plain, gridreg.parameters("*", dim=1), "mask")
+    assert [match.place.size for match in matches] == [16, 4, 4]
+    last = nn.ParameterList(nn.Parameter(torch.zeros(9, channels)) for channels in (16, 4, 4))
+    with pytest.raises(gridreg.InputError, match=r"lengths differ \(0 16, 1 4, 2 4\)"):
+        find(last, gridreg.parameters("*", dim=1), "mask")
+    matches = find(last, gridreg.parameters("*", dim=1, spatial=(0,)), "mask")
     assert [match.place.size for match in matches] == [16, 4, 4]
 
 
