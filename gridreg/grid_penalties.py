@@ -190,6 +190,9 @@ class Orthogonality(Regularizer):
     Lines are the grids with one spatial axis. Planes and voxels beside them are left alone, as in TensoRF;
     at a site without lines they are taken themselves, each channel as one long row.
 
+    Lines of zeros are orthogonal too. While a field has found no matter yet, the gradient of its images is
+    weak, and this one can shrink all lines to nothing: let the weight start later (`Piecewise`).
+
     Args:
         site: the lines among its `grids` are penalised, or all of them if there are no lines.
         weight: factor of the loss; Few TensoRF: 0.01.
