@@ -21,9 +21,9 @@ _local = threading.local()
 def accumulate_into_grad() -> Iterator[None]:
     """Let compiled backward passes add to the ``.grad`` of planes in place, instead of handing out a new tensor.
 
-    For training loops that keep their gradient buffers: a 300^3 grid has 70 MB of them, and to allocate, fill and add as
-    much again in every iteration costs more than the gradient itself. It holds for backward passes that this thread
-    starts, and for planes that are leaves; hooks of such planes are not called. Closing the context ends it.
+    For training loops that keep their gradient buffers: a 300^3 grid has 70 MB of them, and to allocate, fill and
+    add as much again in every iteration costs more than the gradient itself. It holds for backward passes that this
+    thread starts, and for planes that are leaves; hooks of such planes are not called.
 
     Example:
         >>> grids = [torch.ones(2, 2, 4, requires_grad=True) for _ in range(3)], [torch.ones(2, 4)] * 3
@@ -101,12 +101,12 @@ def _opened(lines: Sequence[Tensor], open_channels: int) -> tuple[list[Tensor], 
 def vm_density(u: Tensor, planes: Sequence[Tensor], lines: Sequence[Tensor], open_channels: int) -> Tensor:
     """See `backbones.kernels.vm_density`."""
     lines, read = _opened(lines, open_channels)
-    out: Tensor = _Lookup.apply(vm.density, vm_gradient.density_backward, u, read, *planes, *lines)
+    out: Tensor = _Lookup.apply(vm.density, vm_gradient.density_backward, u, read, *planes, *lines)  # type: ignore[no-untyped-call]
     return out
 
 
 def vm_features(u: Tensor, planes: Sequence[Tensor], lines: Sequence[Tensor], open_channels: int) -> Tensor:
     """See `backbones.kernels.vm_features`."""
     lines, read = _opened(lines, open_channels)
-    out: Tensor = _Lookup.apply(vm.features, vm_gradient.features_backward, u, read, *planes, *lines)
+    out: Tensor = _Lookup.apply(vm.features, vm_gradient.features_backward, u, read, *planes, *lines)  # type: ignore[no-untyped-call]
     return out

@@ -24,10 +24,9 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from llvmlite import ir
-from numba import carray, cfunc, njit, types
+from llvmlite import ir  # type: ignore[import-untyped]
+from numba import carray, cfunc, extending, njit, types  # type: ignore[attr-defined]
 from numba.core.errors import NumbaWarning
-from numba.extending import intrinsic
 
 __all__ = [
     "Kernel",
@@ -38,6 +37,7 @@ __all__ = [
     "int32",
     "int64",
     "integer",
+    "intrinsic",
     "kernel",
     "matrix",
     "next_task",
@@ -51,8 +51,11 @@ float32, int32, int64, uint8 = np.float32, np.int32, np.int64, np.uint8
 
 # Reordering and contraction make sums fast; not-a-number and infinity keep their meaning, as a run must see them.
 _FAST = {"contract", "nsz", "arcp", "reassoc"}
-_TABLE = types.CPointer(types.int64)
+_TABLE = types.CPointer(types.int64)  # type: ignore[no-untyped-call]
 _COMPILING = threading.Lock()
+
+# Untyped: a call from a kernel has fewer arguments than the function that generates it.
+intrinsic: Any = extending.intrinsic
 
 
 class Kernel:
@@ -101,7 +104,7 @@ def exact(function: Callable[..., Any]) -> Any:
     return njit(nogil=True, fastmath=False, error_model="numpy", boundscheck=False)(function)
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@intrinsic
 def _fetch_add(context: Any, pointer: Any, value: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.atomic_rmw("add", arguments[0], arguments[1], "monotonic")
@@ -109,7 +112,7 @@ def _fetch_add(context: Any, pointer: Any, value: Any) -> Any:
     return types.int64(_TABLE, types.int64), generate
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@intrinsic
 def _pointer(context: Any, address: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.inttoptr(arguments[0], ir.IntType(8).as_pointer())
@@ -117,7 +120,7 @@ def _pointer(context: Any, address: Any) -> Any:
     return types.voidptr(types.int64), generate
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@intrinsic
 def _as_double(context: Any, bits: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.bitcast(arguments[0], ir.DoubleType())
@@ -126,46 +129,46 @@ def _as_double(context: Any, bits: Any) -> Any:
 
 
 @inline
-def next_task(table):  # type: ignore[no-untyped-def]
+def next_task(table: Any) -> Any:
     """Number of a task that no other thread has, or -1 when all are taken."""
     task = _fetch_add(table, 1)
     return task if task < table[1] else -1
 
 
 @inline
-def vector(table, place, dtype):  # type: ignore[no-untyped-def]
+def vector(table: Any, place: Any, dtype: Any) -> Any:
     """Argument ``place``, a tensor, as ``(N,)``: all of its elements."""
     base = 2 + 4 * place
     return carray(_pointer(table[base]), (table[base + 1] * table[base + 2] * table[base + 3],), dtype)
 
 
 @inline
-def matrix(table, place, dtype):  # type: ignore[no-untyped-def]
+def matrix(table: Any, place: Any, dtype: Any) -> Any:
     """Argument ``place``, a tensor of two axes."""
     base = 2 + 4 * place
     return carray(_pointer(table[base]), (table[base + 1], table[base + 2]), dtype)
 
 
 @inline
-def cube(table, place, dtype):  # type: ignore[no-untyped-def]
+def cube(table: Any, place: Any, dtype: Any) -> Any:
     """Argument ``place``, a tensor of three axes."""
     base = 2 + 4 * place
     return carray(_pointer(table[base]), (table[base + 1], table[base + 2], table[base + 3]), dtype)
 
 
 @inline
-def integer(table, place):  # type: ignore[no-untyped-def]
+def integer(table: Any, place: Any) -> Any:
     """Argument ``place``, an integer."""
     return table[2 + 4 * place]
 
 
 @inline
-def real(table, place):  # type: ignore[no-untyped-def]
+def real(table: Any, place: Any) -> Any:
     """Argument ``place``, a number, as float32."""
     return np.float32(_as_double(table[2 + 4 * place]))
 
 
 @inline
-def size(table, place, axis):  # type: ignore[no-untyped-def]
+def size(table: Any, place: Any, axis: Any) -> Any:
     """Length of argument ``place``, a tensor, along ``axis``; 1 for an axis that it does not have."""
     return table[3 + 4 * place + axis]

@@ -17,16 +17,20 @@ __all__ = ["cp_density", "cp_features", "vm_density", "vm_features"]
 def _check(u: Tensor, planes: Sequence[Tensor], lines: Sequence[Tensor], open_channels: int | None) -> None:
     if u.dim() != 2 or u.shape[1] != 3:
         raise InputError(f"u: found shape {tuple(u.shape)}, expected (N, 3)")
-    for name, grids, axes in (("planes", planes, 3), ("lines", lines, 2)):
-        if len(grids) != 3 and (name == "lines" or grids):
-            raise InputError(f"{name}: found {len(grids)} of them, expected 3")
-        for k, grid in enumerate(grids):
-            shape = tuple(grid.shape)
-            if len(shape) != axes or min(shape[:-1]) < 2 or shape[-1] != lines[0].shape[-1]:
-                raise InputError(
-                    f"{name}[{k}]: found shape {shape}, expected {axes - 1} edges of at least 2 nodes and "
-                    f"{lines[0].shape[-1]} channels"
-                )
+    if len(lines) != 3 or lines[0].dim() != 2:
+        raise InputError(f"lines: found shapes {[tuple(x.shape) for x in lines]}, expected three (M, C)")
+    edges, channels = [lines[2 - axis].shape[0] for axis in range(3)], lines[0].shape[1]
+    expected: dict[str, list[tuple[int, ...]]] = {
+        "lines": [(edges[axis], channels) for axis in reference.LINE_AXES]
+    }
+    if min(edges) < 2:
+        raise InputError(f"lines: found {edges} nodes along x, y, z, expected at least 2")
+    if planes:
+        expected["planes"] = [(edges[a], edges[b], channels) for a, b in reference.PLANE_AXES]
+    for name, grids in (("lines", lines), ("planes", planes)):
+        shapes = [tuple(x.shape) for x in grids]
+        if shapes != expected.get(name, []):
+            raise InputError(f"{name}: found shapes {shapes}, expected {expected.get(name, [])}")
     if open_channels is not None and open_channels < 0:
         raise InputError(f"open_channels: found {open_channels}, expected None or a number from 0 on")
 
@@ -34,7 +38,8 @@ def _check(u: Tensor, planes: Sequence[Tensor], lines: Sequence[Tensor], open_ch
 def _takes_compiled(*tensors: Tensor) -> bool:
     if chosen_backend() == "torch" or tensors[0].requires_grad:
         return False
-    return all(x.device.type == "cpu" and x.dtype == torch.float32 for x in tensors)
+    # Compiled code counts the elements of a grid in 32 bits.
+    return all(x.device.type == "cpu" and x.dtype == torch.float32 and x.numel() < 2**31 for x in tensors)
 
 
 def _count(lines: Sequence[Tensor], open_channels: int | None) -> int:

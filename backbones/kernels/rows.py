@@ -1,100 +1,153 @@
-"""Who may write where: samples sorted by the row of the plane that they touch.
+"""Who may write where: samples sorted by the row of the grid that they touch.
 
-Adding gradients to a plane in parallel needs owners. Channels as owners split cache lines between threads; so here a
-task owns whole rows. For each plane a counting sort lists the samples by the row below them, in sample order within a
-row. A task takes a range of rows with its share of the samples; samples between its first row and the row before it
-belong to two tasks, and each adds the half that falls on its own rows. Every row then receives its samples in an
-order that depends neither on the threads nor on the number of tasks.
+Adding gradients to a grid in parallel needs owners. Channels as owners split cache lines between threads; here a task
+owns whole rows. A counting sort lists the samples by the row below them, in sample order within a row. A task takes a
+range of rows with its share of the samples; samples between its first row and the row before it belong to two tasks,
+and each adds the half that falls on its own rows. Every row then receives its samples in an order that depends neither
+on the threads nor on the number of tasks; and as the samples of a row come together, its values are fetched once.
 """
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import torch
 from torch import Tensor
 
-from backbones.kernels.compiler import float32, inline, int32, int64, kernel, next_task, size, vector
-from backbones.kernels.lookup import node
+from backbones.kernels.compiler import float32, inline, int32, int64, integer, kernel, next_task, size, vector
+from backbones.kernels.places import BATCH, find, new_places, node
+from backbones.kernels.simd import load, one
 from backbones.kernels.threading import launch
+from backbones.kernels.workspace import room
 
-__all__ = ["TASKS", "owned_rows", "sort_by_row"]
+__all__ = ["ENTRY", "TASKS", "Listing", "list_by_row", "span"]
 
-# Tasks for each plane: more than threads, so that an unlucky thread does not hold the others up.
+# Tasks for each axis or plane: more than threads, so that an unlucky thread does not hold the others up.
 TASKS = 16
+# Elements of an entry of a listing: one for each axis and one more.
+ENTRY = 4
+
+
+class Listing(NamedTuple):
+    """The samples sorted along each of the first axes.
+
+    Args:
+        starts: ``(axes, rows + 1)`` int64; row r of axis k has the entries ``starts[k, r] : starts[k, r + 1]``.
+        nodes: ``(axes, N, 4)`` int32; the node below along x, y and z, and the number of the sample.
+        shares: ``(axes, N, 4)`` float32; the share of the node above along x, y and z, and the upstream gradient.
+    """
+
+    starts: Tensor
+    nodes: Tensor
+    shares: Tensor
+
+
+@inline
+def _count(rows: Any, starts: Any, begin: Any, samples: Any, stride: Any, edge: Any) -> Any:
+    """Make entry r + 1 the place where row r begins."""
+    for row in range(begin, begin + stride):
+        starts[row] = 0
+    for n in range(samples):
+        starts[begin + rows[n] + 1] += 1
+    running = int64(0)
+    for row in range(begin + 1, begin + edge + 1):
+        count = starts[row]
+        starts[row] = running
+        running += count
 
 
 @kernel
-def _sort(table):  # type: ignore[no-untyped-def]
-    """u, active (N,), starts (3, rows + 1) to be filled, order (3, N) to be filled, edges (3,), row of each (N,)."""
-    u = vector(table, 0, float32)
-    active = vector(table, 1, float32)
-    starts_of_all, order_of_all = vector(table, 2, int64), vector(table, 3, int32)
-    edges = vector(table, 4, int64)
-    rows_of_all = vector(table, 5, int32)
-    samples, stride = size(table, 0, 0), size(table, 2, 1)
+def _sort(table: Any) -> None:
+    """u, upstream, whether it is one number for a sample, shape, starts, nodes, shares, rows; a task is an axis."""
+    u, upstream = vector(table, 0, float32), vector(table, 1, float32)
+    summed = integer(table, 2) != 0
+    edges = vector(table, 3, int64)
+    starts, all_rows = vector(table, 4, int64), vector(table, 7, int32)
+    to_nodes, to_shares = vector(table, 5, int32), vector(table, 6, float32)
+    samples, stride = size(table, 0, 0), size(table, 4, 1)
+    shape = edges[0], edges[1], edges[2]
+    places = new_places()
+    nodes, shares = places
     while True:
-        plane = next_task(table)
-        if plane < 0:
+        axis = next_task(table)
+        if axis < 0:
             break
-        axis = 1 if plane == 2 else 0
-        edge = edges[plane]
-        starts = starts_of_all[plane * stride : (plane + 1) * stride]
-        order = order_of_all[plane * samples : (plane + 1) * samples]
-        rows = rows_of_all[plane * samples : (plane + 1) * samples]
-        starts[:] = 0
+        edge, begin = edges[axis], axis * stride
+        rows = all_rows[axis * samples : (axis + 1) * samples]
         for n in range(samples):
-            row = node(u[3 * n + axis], edge)[0] if active[n] != float32(0) else int64(-1)
-            rows[n] = row
-            starts[row + 1] += 1
-        # Entry 0 has counted the samples without a gradient, which are in no row.
-        starts[0] = 0
-        # Entry r + 1 becomes where row r begins, and moves to where it ends while the samples are listed.
-        running = int64(0)
-        for row in range(edge):
-            count = starts[row + 1]
-            starts[row + 1] = running
-            running += count
-        for n in range(samples):
-            row = rows[n]
-            if row >= 0:
-                order[starts[row + 1]] = n
-                starts[row + 1] += 1
+            rows[n] = node(load(u, 3 * n + axis, one()), edge)[0]
+        if summed:
+            # Behind the last row, and so in no task.
+            for n in range(samples):
+                if upstream[n] == float32(0):
+                    rows[n] = edge - 1
+        _count(rows, starts, begin, samples, stride, edge)
+        for first in range(0, samples, BATCH):
+            count = min(int64(BATCH), samples - first)
+            find(places, u, first, count, shape)
+            for q in range(count):
+                row = begin + rows[first + q] + 1
+                to = ENTRY * (axis * samples + starts[row])
+                # Where the row begins moves to where it ends while its samples are listed.
+                starts[row] += 1
+                to_nodes[to] = nodes[q]
+                to_nodes[to + 1] = nodes[BATCH + q]
+                to_nodes[to + 2] = nodes[2 * BATCH + q]
+                to_nodes[to + 3] = first + q
+                to_shares[to] = shares[q]
+                to_shares[to + 1] = shares[BATCH + q]
+                to_shares[to + 2] = shares[2 * BATCH + q]
+                to_shares[to + 3] = upstream[first + q] if summed else float32(1)
 
 
-def sort_by_row(u: Tensor, active: Tensor, edges: list[int]) -> tuple[Tensor, Tensor]:
-    """List the samples of each plane by row.
+def list_by_row(u: Tensor, upstream: Tensor, shape: tuple[int, int, int], sorts: int) -> Listing:
+    """Sort samples by row, once along each of the first axes; the result is overwritten by the thread's next call.
 
     Args:
-        u: ``(N, 3)``.
-        active: ``(N,)`` float32; samples where it is 0 are left out.
-        edges: rows of the three planes.
-
-    Returns:
-        ``order (3, N)`` int32 and ``starts (3, rows + 1)`` int64: row r of plane k has the samples
-        ``order[k, starts[k, r] : starts[k, r + 1]]``.
+        u: ``(N, 3)`` in [0, 1].
+        upstream: gradients; if ``(N,)``, samples where it is 0 are left out.
+        shape: nodes along x, y and z.
+        sorts: number of axes.
     """
     samples = u.shape[0]
-    starts = torch.empty(3, max(edges) + 1, dtype=torch.int64)
-    order, rows = torch.empty(2, 3, samples, dtype=torch.int32)
-    launch(_sort, 3, u, active, starts, order, torch.tensor(edges), rows)
-    return order, starts
+    listing = Listing(
+        room("starts", sorts, max(shape[:sorts]) + 1, dtype=torch.int64),
+        room("nodes", sorts, samples, ENTRY, dtype=torch.int32),
+        room("shares", sorts, samples, ENTRY),
+    )
+    rows = room("rows", sorts, samples, dtype=torch.int32)
+    launch(_sort, sorts, u, upstream, int(upstream.dim() == 1), torch.tensor(shape), *listing, rows)
+    return listing
 
 
 @inline
-def owned_rows(starts, edge, part, parts):  # type: ignore[no-untyped-def]
-    """First and last (exclusive) row of one of ``parts`` ranges with about equal numbers of samples."""
-    first = _row_at(starts, edge, part, parts)
-    return first, _row_at(starts, edge, part + 1, parts)
+def span(starts: Any, begin: Any, edge: Any, part: Any, where: Any) -> Any:
+    """Entries of a third of the samples that task ``part`` of `TASKS` sees.
+
+    Thirds: 0 for those just below its first row, of which the task owns the node above; 1 for those between two of its
+    rows; 2 for those above its last row, of which it owns the node below. ``begin`` is the axis' first entry of
+    ``starts``, ``edge`` its nodes.
+    """
+    first, last = _row_at(starts, begin, edge, part), _row_at(starts, begin, edge, part + 1)
+    low = max(first - 1, 0) if where == 0 else (first if where == 1 else last - 1)
+    high = first if where == 0 else (last - 1 if where == 1 else last)
+    # The last node is below no sample.
+    high = min(high, edge - 1)
+    if last <= first or high <= low:
+        return int64(0), int64(0)
+    return starts[begin + low], starts[begin + high]
 
 
 @inline
-def _row_at(starts, edge, part, parts):  # type: ignore[no-untyped-def]
-    if part == parts:
+def _row_at(starts: Any, begin: Any, edge: Any, part: Any) -> Any:
+    """First row of a task, so that all have about the same number of samples."""
+    if part == TASKS:
         return edge
-    wanted = starts[edge - 1] * part // parts
+    wanted = starts[begin + edge - 1] * part // TASKS
     low, high = int64(0), edge
     while low < high:
         middle = (low + high) // 2
-        if starts[middle] < wanted:
+        if starts[begin + middle] < wanted:
             low = middle + 1
         else:
             high = middle

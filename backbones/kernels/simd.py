@@ -18,12 +18,11 @@ import operator
 from collections.abc import Callable
 from typing import Any
 
-from llvmlite import ir
+from llvmlite import ir  # type: ignore[import-untyped]
 from numba import types
-from numba.core import cgutils
-from numba.extending import intrinsic, models, overload, register_model
+from numba.extending import models, overload, register_model
 
-from backbones.kernels.compiler import inline
+from backbones.kernels.compiler import inline, intrinsic
 
 __all__ = ["LANES", "add_to", "load", "one", "prefetch", "store", "total", "wide"]
 
@@ -45,7 +44,7 @@ _lanes = _Lanes()
 @register_model(_Lanes)
 class _LanesModel(models.PrimitiveModel):  # type: ignore[misc]
     def __init__(self, manager: Any, kind: Any) -> None:
-        super().__init__(manager, kind, _LLVM)
+        super().__init__(manager, kind, _LLVM)  # type: ignore[no-untyped-call]
 
 
 def _element(context: Any, builder: Any, signature: Any, arguments: Any, pointee: Any) -> Any:
@@ -58,7 +57,7 @@ def _width(like: Any) -> Any:
     return _LLVM if isinstance(like, _Lanes) else ir.FloatType()
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@intrinsic
 def _load(context: Any, array: Any, index: Any, like: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.load(_element(context, builder, signature, arguments, _width(like)), align=4)
@@ -66,7 +65,7 @@ def _load(context: Any, array: Any, index: Any, like: Any) -> Any:
     return like(array, types.int64, like), generate
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@intrinsic
 def _store(context: Any, array: Any, index: Any, value: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         pointer = _element(context, builder, signature, arguments, _width(value))
@@ -76,25 +75,24 @@ def _store(context: Any, array: Any, index: Any, value: Any) -> Any:
     return types.void(array, types.int64, value), generate
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@intrinsic
 def prefetch(context: Any, array: Any, index: Any) -> Any:
     """``prefetch(x, i)``: ask for the cache line of element ``i`` of the 1-D array ``x``."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         pointer = _element(context, builder, signature, arguments, ir.IntType(8))
         word = ir.IntType(32)
-        function = cgutils.get_or_insert_function(
-            builder.module,
-            ir.FunctionType(ir.VoidType(), [pointer.type, word, word, word]),
-            "llvm.prefetch.p0",
-        )
+        function = builder.module.globals.get("llvm.prefetch.p0")
+        if function is None:
+            kind = ir.FunctionType(ir.VoidType(), [pointer.type, word, word, word])
+            function = ir.Function(builder.module, kind, "llvm.prefetch.p0")
         builder.call(function, [pointer, word(0), word(3), word(1)])
         return context.get_dummy_value()
 
     return types.void(array, types.int64), generate
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@intrinsic
 def _splat(context: Any, value: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         word = ir.IntType(32)
@@ -105,7 +103,7 @@ def _splat(context: Any, value: Any) -> Any:
     return _lanes(types.float32), generate
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@intrinsic
 def _sum_lanes(context: Any, value: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         word = ir.IntType(32)
@@ -156,31 +154,31 @@ _overload_operator(operator.mul, "fmul")
 
 
 @inline
-def wide():  # type: ignore[no-untyped-def]
+def wide() -> Any:
     """Eight zeros."""
     return _splat(types.float32(0))
 
 
 @inline
-def one():  # type: ignore[no-untyped-def]
+def one() -> Any:
     """A single zero."""
     return types.float32(0)
 
 
 @inline
-def load(x, i, like):  # type: ignore[no-untyped-def]
+def load(x: Any, i: Any, like: Any) -> Any:
     """Elements from ``i`` on of the 1-D array ``x``, as many as ``like`` has."""
     return _load(x, i, like)
 
 
 @inline
-def store(x, i, value):  # type: ignore[no-untyped-def]
+def store(x: Any, i: Any, value: Any) -> Any:
     """Write ``value`` to the elements from ``i`` on of the 1-D array ``x``."""
     _store(x, i, value)
 
 
 @inline
-def add_to(x, i, value):  # type: ignore[no-untyped-def]
+def add_to(x: Any, i: Any, value: Any) -> Any:
     """Add ``value`` to the elements from ``i`` on of the 1-D array ``x``."""
     _store(x, i, _load(x, i, value) + value)
 

@@ -41,7 +41,7 @@ def _openmp_team() -> _Team | None:
     It is looked up through torch's own library, as other packages may have loaded other runtimes.
     """
     name = {"linux": "libtorch_cpu.so", "darwin": "libtorch_cpu.dylib"}.get(sys.platform)
-    if name is None or not torch.backends.openmp.is_available():
+    if name is None or not torch.backends.openmp.is_available():  # type: ignore[no-untyped-call]
         return None
     try:
         parallel = ctypes.CDLL(str(Path(torch.__file__).parent / "lib" / name)).GOMP_parallel

@@ -3,115 +3,123 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from backbones.kernels.compiler import float32, inline, integer, kernel, next_task, size, vector
-from backbones.kernels.lookup import CHUNK, bilinear, chunk, corners, linear, node
+from backbones.kernels.compiler import float32, inline, int32, int64, integer, kernel, next_task, size, vector
+from backbones.kernels.lookup import ahead, bilinear, corners, linear, prefetch_cell
+from backbones.kernels.places import BATCH, axes, batch, find, new_places
 from backbones.kernels.simd import LANES, one, store, total, wide
 from backbones.kernels.threading import launch
 
-__all__ = ["density", "features"]
+__all__ = ["density", "features", "plane_sum"]
 
 
 @inline
-def _place(u, n, a, b, v, rows, columns, nodes, channels):  # type: ignore[no-untyped-def]
-    """Of sample ``n``: where its rows begin in the plane and the line, and the weights."""
-    i, share_a = node(u[3 * n + a], rows)
-    j, share_b = node(u[3 * n + b], columns)
-    k, share = node(u[3 * n + v], nodes)
-    return (i * columns + j) * channels, corners(share_a, share_b), k * channels, share
+def _product(grids: Any, at: Any, below: Any, channels: Any, down: Any, w: Any, share: Any, like: Any) -> Any:
+    plane, line = grids
+    return bilinear(plane, at, channels, down, w, like) * linear(line, below, channels, share, like)
 
 
 @inline
-def _product(plane, line, at, down, w, below, share, channels, c, like):  # type: ignore[no-untyped-def]
-    value = bilinear(plane, at, channels, down, w, c, like)
-    return value * linear(line, below, channels, share, c, like)
-
-
-@inline
-def _dot(u, n, a, b, v, plane, line, rows, columns, nodes, channels, blocks, channels_read):  # type: ignore[no-untyped-def]
-    """Sum over the open channels of plane times line at sample ``n``."""
-    at, w, below, share = _place(u, n, a, b, v, rows, columns, nodes, channels)
-    down = columns * channels
+def plane_sum(
+    grids: Any, at: Any, below: Any, channels: Any, down: Any, w: Any, share: Any, read: Any
+) -> Any:
+    """Sum over channels of plane times line; ``at`` and ``below`` are their first elements, ``down`` a row's length."""
+    blocks = read - read % LANES
     lanes = wide()
     for c in range(0, blocks, LANES):
-        lanes = lanes + _product(plane, line, at, down, w, below, share, channels, c, wide())
+        lanes = lanes + _product(grids, at + c, below + c, channels, down, w, share, wide())
     value = total(lanes)
-    for c in range(blocks, channels_read):
-        value += _product(plane, line, at, down, w, below, share, channels, c, one())
+    for c in range(blocks, read):
+        value += _product(grids, at + c, below + c, channels, down, w, share, one())
     return value
 
 
-@kernel
-def _density(table):  # type: ignore[no-untyped-def]
-    """u, three planes, three lines, channels to read, out."""
-    u = vector(table, 0, float32)
-    plane0, plane1, plane2 = vector(table, 1, float32), vector(table, 2, float32), vector(table, 3, float32)
-    line0, line1, line2 = vector(table, 4, float32), vector(table, 5, float32), vector(table, 6, float32)
-    read = integer(table, 7)
-    out = vector(table, 8, float32)
-    x, y, z, channels = size(table, 6, 0), size(table, 5, 0), size(table, 4, 0), size(table, 4, 1)
-    blocks = read - read % LANES
-    while True:
-        task = next_task(table)
-        if task < 0:
-            break
-        first, last = chunk(task, out.shape[0])
-        for n in range(first, last):
-            value = _dot(u, n, 0, 1, 2, plane0, line0, x, y, z, channels, blocks, read)
-            value += _dot(u, n, 0, 2, 1, plane1, line1, x, z, y, channels, blocks, read)
-            value += _dot(u, n, 1, 2, 0, plane2, line2, y, z, x, channels, blocks, read)
-            out[n] = value
-
-
 @inline
-def _write(u, n, a, b, v, plane, line, rows, columns, nodes, channels, blocks, read, out, to):  # type: ignore[no-untyped-def]
-    """Plane times line at sample ``n`` to ``out`` from element ``to`` on."""
-    at, w, below, share = _place(u, n, a, b, v, rows, columns, nodes, channels)
-    down = columns * channels
+def _write(
+    grids: Any,
+    at: Any,
+    below: Any,
+    channels: Any,
+    down: Any,
+    w: Any,
+    share: Any,
+    read: Any,
+    out: Any,
+    to: Any,
+) -> Any:
+    """Plane times line to ``out`` from element ``to`` on; 0 for channels that are not read."""
+    blocks = read - read % LANES
     for c in range(0, blocks, LANES):
-        store(out, to + c, _product(plane, line, at, down, w, below, share, channels, c, wide()))
+        store(out, to + c, _product(grids, at + c, below + c, channels, down, w, share, wide()))
     for c in range(blocks, read):
-        store(out, to + c, _product(plane, line, at, down, w, below, share, channels, c, one()))
+        store(out, to + c, _product(grids, at + c, below + c, channels, down, w, share, one()))
     for c in range(read, channels):
         out[to + c] = float32(0)
 
 
-@kernel
-def _features(table):  # type: ignore[no-untyped-def]
-    """u, three planes, three lines, channels to read, out."""
-    u = vector(table, 0, float32)
-    plane0, plane1, plane2 = vector(table, 1, float32), vector(table, 2, float32), vector(table, 3, float32)
-    line0, line1, line2 = vector(table, 4, float32), vector(table, 5, float32), vector(table, 6, float32)
-    read = integer(table, 7)
-    out = vector(table, 8, float32)
-    x, y, z, channels = size(table, 6, 0), size(table, 5, 0), size(table, 4, 0), size(table, 4, 1)
-    blocks = read - read % LANES
+@inline
+def _forward(table: Any, summed: Any) -> Any:
+    u, read, out = vector(table, 0, float32), integer(table, 7), vector(table, 8, float32)
+    samples, channels, far = size(table, 0, 0), size(table, 4, 1), ahead(read)
+    shape = size(table, 6, 0), size(table, 5, 0), size(table, 4, 0)
+    places = new_places()
+    nodes, shares = places
+    starts = np.empty(BATCH, int32)
     while True:
         task = next_task(table)
         if task < 0:
             break
-        first, last = chunk(task, size(table, 8, 0))
-        for n in range(first, last):
-            to = 3 * n * channels
-            _write(u, n, 0, 1, 2, plane0, line0, x, y, z, channels, blocks, read, out, to)
-            to += channels
-            _write(u, n, 0, 2, 1, plane1, line1, x, z, y, channels, blocks, read, out, to)
-            to += channels
-            _write(u, n, 1, 2, 0, plane2, line2, y, z, x, channels, blocks, read, out, to)
+        first, last = batch(task, samples)
+        count = last - first
+        find(places, u, first, count, shape)
+        for k in range(3):
+            grids = vector(table, 1 + k, float32), vector(table, 4 + k, float32)
+            a, b, v = axes(k)
+            a, b, v = a * BATCH, b * BATCH, v * BATCH
+            columns = size(table, 1 + k, 1)
+            down = columns * channels
+            for q in range(count):
+                starts[q] = (nodes[a + q] * int32(columns) + nodes[b + q]) * int32(channels)
+            for q in range(count):
+                if q + far < count:
+                    prefetch_cell(grids[0], int64(starts[q + far]), channels, down, read)
+                at, below, share = int64(starts[q]), int64(nodes[v + q]) * channels, shares[v + q]
+                w = corners(shares[a + q], shares[b + q])
+                n = first + q
+                if summed:
+                    value = plane_sum(grids, at, below, channels, down, w, share, read)
+                    out[n] = value if k == 0 else out[n] + value
+                else:
+                    to = (3 * n + k) * channels
+                    _write(grids, at, below, channels, down, w, share, read, out, to)
+
+
+@kernel
+def _density(table: Any) -> None:
+    """u, three planes, three lines, channels to read, out."""
+    _forward(table, True)
+
+
+@kernel
+def _features(table: Any) -> None:
+    """u, three planes, three lines, channels to read, out."""
+    _forward(table, False)
 
 
 def density(u: Tensor, planes: Sequence[Tensor], lines: Sequence[Tensor], read: int) -> Tensor:
     """``(N,)``; all contiguous float32 on the CPU, ``read`` the number of channels to use."""
     out = torch.empty(u.shape[0])
-    launch(_density, -(-u.shape[0] // CHUNK), u, *planes, *lines, read, out)
+    launch(_density, -(-u.shape[0] // BATCH), u, *planes, *lines, read, out)
     return out
 
 
 def features(u: Tensor, planes: Sequence[Tensor], lines: Sequence[Tensor], read: int) -> Tensor:
     """``(N, 3 C)``; arguments as for `density`."""
     out = torch.empty(u.shape[0], 3 * lines[0].shape[1])
-    launch(_features, -(-u.shape[0] // CHUNK), u, *planes, *lines, read, out)
+    launch(_features, -(-u.shape[0] // BATCH), u, *planes, *lines, read, out)
     return out

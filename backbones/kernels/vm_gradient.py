@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from backbones.kernels.compiler import (
+    Kernel,
     float32,
     inline,
     int32,
@@ -18,277 +21,150 @@ from backbones.kernels.compiler import (
     size,
     vector,
 )
-from backbones.kernels.lookup import bilinear, corners, linear, node
-from backbones.kernels.rows import TASKS, owned_rows, sort_by_row
-from backbones.kernels.simd import LANES, add_to, load, one, wide
+from backbones.kernels.lookup import ahead, bilinear, corners, linear, prefetch_cell, prefetch_row
+from backbones.kernels.places import axes
+from backbones.kernels.rows import ENTRY, TASKS, list_by_row, span
+from backbones.kernels.simd import LANES, load, one, store, wide
 from backbones.kernels.threading import launch
+from backbones.kernels.workspace import room
 
 __all__ = ["density_backward", "features_backward"]
 
 
 @inline
-def _same(upstream, n, width, c, like):  # type: ignore[no-untyped-def]
-    """Gradient of a sum over channels: the same for all of them."""
-    return upstream[n]
+def _add(
+    grids: Any, at: Any, below: Any, down: Any, w: Any, share: Any, g: Any, to: Any, i: Any, j: Any, m: Any,
+    channels: Any, like: Any,
+) -> Any:  # fmt: skip
+    """Add the gradient of some channels of a sample to four nodes of the plane and two of the line.
+
+    All is read before anything is written: a processor holds a load back behind a store that agrees with it in the low
+    bits of the address, and a gradient lies where its parameter does, but for these.
+    """
+    plane, line = grids
+    to_lower, to_upper, to_line = to
+    on_plane = linear(line, below, channels, share, like) * g
+    on_line = bilinear(plane, at, channels, down, w, like) * g
+    p00 = load(to_lower, i, like) + on_plane * w[0]
+    p01 = load(to_lower, i + channels, like) + on_plane * w[1]
+    p10 = load(to_upper, j, like) + on_plane * w[2]
+    p11 = load(to_upper, j + channels, like) + on_plane * w[3]
+    l0 = load(to_line, m, like) + on_line * (float32(1) - share)
+    l1 = load(to_line, m + channels, like) + on_line * share
+    store(to_lower, i, p00)
+    store(to_lower, i + channels, p01)
+    store(to_upper, j, p10)
+    store(to_upper, j + channels, p11)
+    store(to_line, m, l0)
+    store(to_line, m + channels, l1)
 
 
 @inline
-def _each(upstream, n, width, c, like):  # type: ignore[no-untyped-def]
-    """Gradient of concatenated channels."""
-    return load(upstream, n * width + c, like)
-
-
-@inline
-def _add_rows(
-    gradient, line, upstream, get, n, width, first, at, down, w, below, share, lower, upper, channels, c, like
-):  # type: ignore[no-untyped-def]
-    """Add to the four nodes of the plane around sample ``n``: to those of the lower row, the upper row or both."""
-    value = linear(line, below, channels, share, c, like) * get(upstream, n, width, first + c, like)
-    if lower:
-        add_to(gradient, at + c, value * w[0])
-        add_to(gradient, at + channels + c, value * w[1])
-    if upper:
-        add_to(gradient, at + down + c, value * w[2])
-        add_to(gradient, at + down + channels + c, value * w[3])
-
-
-@inline
-def _plane(
-    u,
-    a,
-    b,
-    v,
-    line,
-    gradient,
-    upstream,
-    get,
-    width,
-    first,
-    rows,
-    columns,
-    nodes,
-    channels,
-    read,
-    order,
-    starts,
-    part,
-):  # type: ignore[no-untyped-def]
-    """Gradient of the rows that task ``part`` owns."""
-    start, stop = owned_rows(starts, rows, part, TASKS)
+def _serve(
+    grids: Any, to_plane: Any, to: Any, keep: Any, listing: Any, entries: Any, places: Any, columns: Any,
+    channels: Any, read: Any, upstream: Any, summed: Any,
+) -> Any:  # fmt: skip
+    """Add the gradients of a range of entries; what is not kept goes to the first elements of its array."""
+    nodes, shares = listing
+    a, b, v, k = places
     blocks = read - read % LANES
     down = columns * channels
-    for row in range(max(start - 1, 0), stop if stop > start else 0):
-        lower, upper = row >= start, row + 1 < stop
-        for q in range(starts[row], starts[row + 1]):
-            n = int64(order[q])
-            share_a = node(u[3 * n + a], rows)[1]
-            j, share_b = node(u[3 * n + b], columns)
-            k, share = node(u[3 * n + v], nodes)
-            w = corners(share_a, share_b)
-            at = (row * columns + j) * channels
-            for c in range(0, blocks, LANES):
-                _add_rows(
-                    gradient,
-                    line,
-                    upstream,
-                    get,
-                    n,
-                    width,
-                    first,
-                    at,
-                    down,
-                    w,
-                    k * channels,
-                    share,
-                    lower,
-                    upper,
-                    channels,
-                    c,
-                    wide(),
-                )
-            for c in range(blocks, read):
-                _add_rows(
-                    gradient,
-                    line,
-                    upstream,
-                    get,
-                    n,
-                    width,
-                    first,
-                    at,
-                    down,
-                    w,
-                    k * channels,
-                    share,
-                    lower,
-                    upper,
-                    channels,
-                    c,
-                    one(),
-                )
+    far = ENTRY * ahead(read)
+    first, last = entries
+    for e in range(first, last, ENTRY):
+        then = min(e + far, last - ENTRY)
+        at = (int64(nodes[then + a]) * columns + int64(nodes[then + b])) * channels
+        prefetch_cell(grids[0], at, channels, down, read)
+        prefetch_cell(to_plane, at, channels, down, read)
+        if not summed:
+            prefetch_row(upstream, (3 * int64(nodes[then + 3]) + k) * channels, read)
+        at = (int64(nodes[e + a]) * columns + int64(nodes[e + b])) * channels
+        below, share = int64(nodes[e + v]) * channels, shares[e + v]
+        w = corners(shares[e + a], shares[e + b])
+        i, j, m = at & keep[0], (at + down) & keep[1], below & keep[0]
+        g = shares[e + 3]
+        n = (3 * int64(nodes[e + 3]) + k) * channels
+        for c in range(0, blocks, LANES):
+            gc = wide() + g if summed else load(upstream, n + c, wide())
+            _add(grids, at + c, below + c, down, w, share, gc, to, i + c, j + c, m + c, channels, wide())
+        for c in range(blocks, read):
+            gc = g if summed else load(upstream, n + c, one())
+            _add(grids, at + c, below + c, down, w, share, gc, to, i + c, j + c, m + c, channels, one())
 
 
 @inline
-def _add_line(plane, gradient, upstream, get, n, width, first, at, down, w, below, share, channels, c, like):  # type: ignore[no-untyped-def]
-    value = bilinear(plane, at, channels, down, w, c, like) * get(upstream, n, width, first + c, like)
-    add_to(gradient, below + c, value * (float32(1) - share))
-    add_to(gradient, below + channels + c, value * share)
-
-
-@inline
-def _line(u, n, a, b, v, plane, gradient, upstream, get, width, first, rows, columns, nodes, channels, read):  # type: ignore[no-untyped-def]
-    """Gradient of one line from one sample, into the task's own copy."""
-    i, share_a = node(u[3 * n + a], rows)
-    j, share_b = node(u[3 * n + b], columns)
-    k, share = node(u[3 * n + v], nodes)
-    w = corners(share_a, share_b)
-    at, down, below = (i * columns + j) * channels, columns * channels, k * channels
-    blocks = read - read % LANES
-    for c in range(0, blocks, LANES):
-        _add_line(
-            plane, gradient, upstream, get, n, width, first, at, down, w, below, share, channels, c, wide()
-        )
-    for c in range(blocks, read):
-        _add_line(
-            plane, gradient, upstream, get, n, width, first, at, down, w, below, share, channels, c, one()
-        )
-
-
-@inline
-def _backward(table, get, step):  # type: ignore[no-untyped-def]
-    u = vector(table, 0, float32)
-    plane0, plane1, plane2 = vector(table, 1, float32), vector(table, 2, float32), vector(table, 3, float32)
-    line0, line1, line2 = vector(table, 4, float32), vector(table, 5, float32), vector(table, 6, float32)
-    read = integer(table, 7)
-    upstream = vector(table, 8, float32)
-    to_plane0, to_plane1, to_plane2 = (
-        vector(table, 9, float32),
-        vector(table, 10, float32),
-        vector(table, 11, float32),
-    )
+def _own_line(table: Any, k: Any, part: Any, channels: Any) -> Any:
+    """The copy of line ``k``'s gradient that belongs to a task, set to 0."""
+    first = part * size(table, 12, 1)
+    if k > 0:
+        first += size(table, 4, 0)
+    if k > 1:
+        first += size(table, 5, 0)
     copies = vector(table, 12, float32)
-    orders, all_starts = vector(table, 13, int32), vector(table, 14, int64)
-    active = vector(table, 15, float32)
-    x, y, z, channels = size(table, 6, 0), size(table, 5, 0), size(table, 4, 0), size(table, 4, 1)
-    samples, stride, width = size(table, 0, 0), size(table, 14, 1), size(table, 8, 1)
-    length = (x + y + z) * channels
+    own = copies[first * channels : (first + size(table, 4 + k, 0)) * channels]
+    for i in range(own.shape[0]):
+        own[i] = float32(0)
+    return own
+
+
+@inline
+def _backward(table: Any, summed: Any) -> Any:
+    read, upstream = integer(table, 7), vector(table, 8, float32)
+    starts, nodes, shares = vector(table, 13, int64), vector(table, 14, int32), vector(table, 15, float32)
+    channels, samples, stride = size(table, 4, 1), size(table, 0, 0), size(table, 13, 1)
+    waste = np.zeros(2 * channels, float32)
     while True:
         task = next_task(table)
         if task < 0:
             break
-        kind, part = task // TASKS, task % TASKS
-        if kind < 3:
-            order = orders[kind * samples : (kind + 1) * samples]
-            starts = all_starts[kind * stride : (kind + 1) * stride]
-            if kind == 0:
-                _plane(
-                    u,
-                    0,
-                    1,
-                    2,
-                    line0,
-                    to_plane0,
-                    upstream,
-                    get,
-                    width,
-                    0,
-                    x,
-                    y,
-                    z,
-                    channels,
-                    read,
-                    order,
-                    starts,
-                    part,
-                )
-            elif kind == 1:
-                _plane(
-                    u,
-                    0,
-                    2,
-                    1,
-                    line1,
-                    to_plane1,
-                    upstream,
-                    get,
-                    width,
-                    step,
-                    x,
-                    z,
-                    y,
-                    channels,
-                    read,
-                    order,
-                    starts,
-                    part,
-                )
-            else:
-                _plane(
-                    u,
-                    1,
-                    2,
-                    0,
-                    line2,
-                    to_plane2,
-                    upstream,
-                    get,
-                    width,
-                    2 * step,
-                    y,
-                    z,
-                    x,
-                    channels,
-                    read,
-                    order,
-                    starts,
-                    part,
-                )
-        else:
-            copy = copies[part * length : (part + 1) * length]
-            copy[:] = float32(0)
-            to_line0 = copy[: z * channels]
-            to_line1 = copy[z * channels : (z + y) * channels]
-            to_line2 = copy[(z + y) * channels :]
-            for n in range(part * samples // TASKS, (part + 1) * samples // TASKS):
-                if active[n] == float32(0):
-                    continue
-                _line(u, n, 0, 1, 2, plane0, to_line0, upstream, get, width, 0, x, y, z, channels, read)
-                _line(u, n, 0, 2, 1, plane1, to_line1, upstream, get, width, step, x, z, y, channels, read)
-                _line(
-                    u, n, 1, 2, 0, plane2, to_line2, upstream, get, width, 2 * step, y, z, x, channels, read
-                )
+        k, part = task // TASKS, task % TASKS
+        grids = vector(table, 1 + k, float32), vector(table, 4 + k, float32)
+        to_plane = vector(table, 9 + k, float32)
+        to_line = _own_line(table, k, part, channels)
+        a, b, v = axes(k)
+        rows, columns = size(table, 1 + k, 0), size(table, 1 + k, 1)
+        for where in range(3):
+            first, last = span(starts, a * stride, rows, part, where)
+            # What falls on rows of another task, which sees these samples too, goes to waste.
+            to = (
+                waste if where == 0 else to_plane,
+                waste if where == 2 else to_plane,
+                waste if where == 0 else to_line,
+            )
+            keep = int64(0 if where == 0 else -1), int64(0 if where == 2 else -1)
+            entries = ENTRY * (a * samples + first), ENTRY * (a * samples + last)
+            _serve(
+                grids, to_plane, to, keep, (nodes, shares), entries, (a, b, v, k), columns, channels, read,
+                upstream, summed,
+            )  # fmt: skip
 
 
 @kernel
-def _density_backward(table):  # type: ignore[no-untyped-def]
-    """u, planes, lines, channels, upstream, plane gradients, line copies, order, starts, active."""
-    _backward(table, _same, 0)
+def _density_backward(table: Any) -> None:
+    """u, planes, lines, channels to read, upstream, plane gradients, line copies, listing."""
+    _backward(table, True)
 
 
 @kernel
-def _features_backward(table):  # type: ignore[no-untyped-def]
+def _features_backward(table: Any) -> None:
     """Arguments as of `_density_backward`."""
-    _backward(table, _each, size(table, 4, 1))
+    _backward(table, False)
 
 
-def _run(compiled, u, planes, lines, read, upstream, plane_gradients, active):  # type: ignore[no-untyped-def]
-    order, starts = sort_by_row(u, active, [p.shape[0] for p in planes])
-    copies = torch.empty(TASKS, sum(line.shape[0] for line in lines), lines[0].shape[1])
-    launch(
-        compiled,
-        4 * TASKS,
-        u,
-        *planes,
-        *lines,
-        read,
-        upstream,
-        *plane_gradients,
-        copies,
-        order,
-        starts,
-        active,
-    )
-    return list(copies.sum(0).split([line.shape[0] for line in lines]))
+def _run(
+    compiled: Kernel,
+    u: Tensor,
+    planes: Sequence[Tensor],
+    lines: Sequence[Tensor],
+    read: int,
+    upstream: Tensor,
+    plane_gradients: Sequence[Tensor],
+) -> list[Tensor]:
+    nodes = [line.shape[0] for line in lines]
+    listing = list_by_row(u, upstream, (nodes[2], nodes[1], nodes[0]), 2)
+    copies = room("copies", TASKS, sum(nodes), lines[0].shape[1])
+    launch(compiled, 3 * TASKS, u, *planes, *lines, read, upstream, *plane_gradients, copies, *listing)
+    return list(torch.split(copies.sum(0), nodes))
 
 
 def density_backward(
@@ -299,8 +175,8 @@ def density_backward(
     upstream: Tensor,
     plane_gradients: Sequence[Tensor],
 ) -> list[Tensor]:
-    """Adds to ``plane_gradients`` in place and returns the gradients of the lines."""
-    return _run(_density_backward, u, planes, lines, read, upstream, plane_gradients, upstream)
+    """Adds to ``plane_gradients`` in place and returns the gradients of the lines; upstream ``(N,)``."""
+    return _run(_density_backward, u, planes, lines, read, upstream, plane_gradients)
 
 
 def features_backward(
@@ -311,5 +187,5 @@ def features_backward(
     upstream: Tensor,
     plane_gradients: Sequence[Tensor],
 ) -> list[Tensor]:
-    """Adds to ``plane_gradients`` in place and returns the gradients of the lines."""
-    return _run(_features_backward, u, planes, lines, read, upstream, plane_gradients, torch.ones(u.shape[0]))
+    """Adds to ``plane_gradients`` in place and returns the gradients of the lines; upstream ``(N, 3 C)``."""
+    return _run(_features_backward, u, planes, lines, read, upstream, plane_gradients)

@@ -1,0 +1,58 @@
+"""Where the samples of a batch lie on a grid, for kernels."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from backbones.kernels.compiler import float32, inline, int32
+from backbones.kernels.simd import load, one
+
+__all__ = ["BATCH", "axes", "batch", "find", "new_places", "node"]
+
+# Samples of a batch: their places fit into the first-level cache.
+BATCH = 256
+
+
+@inline
+def batch(task: Any, count: Any) -> Any:
+    """First and last (exclusive) of the samples of a task."""
+    return task * BATCH, min(count, (task + 1) * BATCH)
+
+
+@inline
+def axes(k: Any) -> Any:
+    """The two axes of plane ``k``, and the axis of line ``k``."""
+    return 1 if k == 2 else 0, 1 if k == 0 else 2, 2 - k
+
+
+@inline
+def node(u: Any, edge: Any) -> Any:
+    """Node below coordinate ``u``, clamped to [0, 1], on ``edge`` nodes, and the share of the node above it.
+
+    Not-a-number gives node 0 and a share that is not a number: nothing is read out of bounds, nothing is hidden.
+    """
+    u = float32(0) if u < float32(0) else u
+    u = float32(1) if u > float32(1) else u
+    scaled = u * float32(edge - 1)
+    lower = min(int32(scaled), int32(edge - 2)) if scaled >= float32(0) else int32(0)
+    return lower, scaled - float32(lower)
+
+
+@inline
+def new_places() -> Any:
+    """Room for a batch: node below along each of the three axes, and share of the node above."""
+    return np.empty(3 * BATCH, int32), np.empty(3 * BATCH, float32)
+
+
+@inline
+def find(places: Any, u: Any, first: Any, count: Any, shape: Any) -> Any:
+    """Fill ``places`` for ``count`` samples from ``first`` on, on a grid of ``shape`` nodes."""
+    nodes, shares = places
+    for axis in range(3):
+        edge = shape[axis]
+        for q in range(count):
+            lower, share = node(load(u, 3 * (first + q) + axis, one()), edge)
+            nodes[axis * BATCH + q] = lower
+            shares[axis * BATCH + q] = share
