@@ -37,11 +37,12 @@ def _moments(p: Any, m: Any, v: Any, i: int, c: Any, gradient: Any, s: Any) -> N
 
 
 @inline
-def _flat_step(p: Any, g: Any, m: Any, v: Any, i: int, like: Any, s: Any, k: Any) -> tuple[Any, Any, Any]:
-    """One step of `_flat`; returns what it adds to the sums of ``|g|``, ``|p|`` and ``p^2``."""
+def _flat_step(p: Any, g: Any, m: Any, v: Any, i: int, like: Any, s: Any, k: Any) -> tuple[Any, Any]:
+    """One step of `_flat`; returns what it adds to the sums of ``|p|`` and ``p^2``."""
     c, slope = load(p, i, like), load(g, i, like)
+    store(g, i, like)
     _moments(p, m, v, i, c, slope + k.sign * sign(c) + k.value * c, s)
-    return magnitude(slope), magnitude(c), c * c
+    return magnitude(c), c * c
 
 
 @inline
@@ -86,22 +87,19 @@ def _flat(table: Any) -> None:
         end = min((task + 1) * _FLAT, p.shape[0])
         for first in range(task * _FLAT, end, _PIECE):
             last = min(first + _PIECE, end)
-            if skips and _idle(g, m, v, first, last):
+            if skips and m[first] == _ZERO and _idle(g, m, v, first, last):
                 continue
             split = last - (last - first) % LANES
-            slopes, sizes, squares = wide(), wide(), wide()
+            sizes, squares = wide(), wide()
             for i in range(first, split, LANES):
-                slope, size, square = _flat_step(p, g, m, v, i, wide(), s, k)
-                slopes, sizes, squares = slopes + slope, sizes + size, squares + square
-            slope_sum, size_sum, square_sum = total(slopes), total(sizes), total(squares)
+                size, square = _flat_step(p, g, m, v, i, wide(), s, k)
+                sizes, squares = sizes + size, squares + square
+            size_sum, square_sum = total(sizes), total(squares)
             for i in range(split, last):
-                slope, size, square = _flat_step(p, g, m, v, i, one(), s, k)
-                slope_sum, size_sum, square_sum = slope_sum + slope, size_sum + size, square_sum + square
+                size, square = _flat_step(p, g, m, v, i, one(), s, k)
+                size_sum, square_sum = size_sum + size, square_sum + square
             sums[task, 3] += size_sum
             sums[task, 4] += square_sum
-            if slope_sum != _ZERO:
-                for i in range(first, last):
-                    g[i] = _ZERO
 
 
 @inline
@@ -119,12 +117,13 @@ def _grid_step(
     like: Any,
     s: Any,
     k: Any,
-) -> tuple[Any, Any, Any, Any, Any, Any]:
-    """One step of `_grid`; returns what it adds to the sums of ``|g|`` and of the five terms.
+) -> tuple[Any, Any, Any, Any, Any]:
+    """One step of `_grid`; returns what it adds to the sums of the five terms.
 
     A missing neighbour is the element itself, as its offset is 0: its difference is 0.
     """
     c, low, slope = load(p, i, like), load(kept, to, like), load(g, i, like)
+    store(g, i, like)
     # From here on `kept` holds the present slab, up to and with this step.
     store(kept, to, c)
     by_slab = load(high, ahead, like) - c
@@ -134,7 +133,7 @@ def _grid_step(
     gradient = gradient + k.rows * (c - load(kept, to - n.up, like) - by_row)
     gradient = gradient + k.sign * sign(c) + k.value * c
     _moments(p, m, v, i, c, gradient, s)
-    return magnitude(slope), by_slab * by_slab, by_row * by_row, by_node * by_node, magnitude(c), c * c
+    return by_slab * by_slab, by_row * by_row, by_node * by_node, magnitude(c), c * c
 
 
 @inline
@@ -158,26 +157,21 @@ def _grid_piece(
     for first in range(0, count, _PIECE):
         last = min(first + _PIECE, count)
         split = last - (last - first) % LANES
-        a0, a1, a2, a3, a4, a5 = wide(), wide(), wide(), wide(), wide(), wide()
+        a0, a1, a2, a3, a4 = wide(), wide(), wide(), wide(), wide()
         for i in range(first, split, LANES):
-            b0, b1, b2, b3, b4, b5 = _grid_step(
+            b0, b1, b2, b3, b4 = _grid_step(
                 p, g, m, v, kept, high, at + i, to + i, ahead + i, n, wide(), s, k
             )
-            a0, a1, a2, a3, a4, a5 = a0 + b0, a1 + b1, a2 + b2, a3 + b3, a4 + b4, a5 + b5
-        c0, c1, c2, c3, c4, c5 = total(a0), total(a1), total(a2), total(a3), total(a4), total(a5)
+            a0, a1, a2, a3, a4 = a0 + b0, a1 + b1, a2 + b2, a3 + b3, a4 + b4
+        c0, c1, c2, c3, c4 = total(a0), total(a1), total(a2), total(a3), total(a4)
         for i in range(split, last):
-            d0, d1, d2, d3, d4, d5 = _grid_step(
-                p, g, m, v, kept, high, at + i, to + i, ahead + i, n, one(), s, k
-            )
-            c0, c1, c2, c3, c4, c5 = c0 + d0, c1 + d1, c2 + d2, c3 + d3, c4 + d4, c5 + d5
-        sums[0] += c1
-        sums[1] += c2
-        sums[2] += c3
-        sums[3] += c4
-        sums[4] += c5
-        if c0 != _ZERO:
-            for i in range(at + first, at + last):
-                g[i] = _ZERO
+            d0, d1, d2, d3, d4 = _grid_step(p, g, m, v, kept, high, at + i, to + i, ahead + i, n, one(), s, k)
+            c0, c1, c2, c3, c4 = c0 + d0, c1 + d1, c2 + d2, c3 + d3, c4 + d4
+        sums[0] += c0
+        sums[1] += c1
+        sums[2] += c2
+        sums[3] += c3
+        sums[4] += c4
 
 
 @kernel
