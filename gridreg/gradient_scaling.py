@@ -47,9 +47,8 @@ class _ValueOf(torch.autograd.Function):
 def scale_gradients_by_distance(samples: RaySamples, distance: float = 1.0) -> RaySamples:
     """Multiply the gradient of density and colour at each sample by ``clamp((t / distance)^2, 0, 1)``.
 
-    Near a camera a cell is seen by more rays than far away, and so gets larger gradients: floating matter
-        grows
-    there. No value changes, bit for bit.
+    Near a camera a cell is seen by more rays than far away and so gets larger gradients: floating matter
+    grows there. No value changes, bit for bit.
 
     Args:
         samples: `N` samples whose weights follow from density and delta (`optical_depth_to_weights`).

@@ -33,9 +33,8 @@ def occlusion_loss(
 
     The sum is divided by the number of all steps of all rays, as FreeNeRF's mean over a full rectangle of
     samples is; steps that the march skipped count as density 0. So the value does not depend on what was
-    skipped, and a ray that misses the box adds nothing. It does depend on the share of the ray that the
-    mask
-    covers: with half the step length, `count` covers half the distance, while `distance` means the same.
+    skipped, and a ray that misses the box adds nothing. It does depend on the share of the ray that is
+    masked: with half the step length `count` covers half the distance, while `distance` means the same.
 
     Args:
         samples: `R` rays with `N` samples.

@@ -23,6 +23,8 @@ class Field(nn.Module):
         self.line = nn.Parameter(torch.randn(3, 5, generator=generator))
         self.plane = nn.Parameter(torch.randn(3, 5, 5, generator=generator))
         self.decoder = nn.Linear(3, 1)
+        for parameter in self.decoder.parameters():
+            nn.init.normal_(parameter, generator=generator)
 
 
 def groups_of(field: Field) -> list[dict[str, Any]]:
@@ -147,3 +149,46 @@ class TestLearningRate:
 def test_bad_arguments(cls: Any, arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         cls(**{"site": LINES, **arguments})
+
+
+@pytest.mark.parametrize(
+    "regularizer",
+    [WeightDecay(LINES, Linear(0.5, 0.0)), LearningRate(LINES, Linear(1.0, 0.2))],
+    ids=["WeightDecay", "LearningRate"],
+)
+def test_a_run_goes_on_from_a_saved_optimizer(regularizer: gridreg.Regularizer) -> None:
+    def start() -> tuple[Field, gridreg.Handle, torch.optim.Optimizer]:
+        field = Field()
+        handle = gridreg.apply(field, regularizer, total_steps=10)
+        return field, handle, torch.optim.AdamW(handle.parameter_groups(groups_of(field)), weight_decay=0.0)
+
+    def run(field: Field, handle: gridreg.Handle, optimizer: torch.optim.Optimizer, steps: range) -> None:
+        for step in steps:
+            handle.step(step)
+            handle.update_groups(optimizer.param_groups)
+            optimizer.zero_grad()
+            quadratic(field).backward()
+            optimizer.step()
+
+    whole, half, rest = start(), start(), start()
+    run(*whole, range(8))
+    run(*half, range(4))
+    rest[0].load_state_dict(half[0].state_dict())
+    rest[1].load_state_dict(half[1].state_dict())
+    rest[2].load_state_dict(half[2].state_dict())
+    run(*rest, range(4, 8))
+    for expected, found in zip(whole[0].parameters(), rest[0].parameters(), strict=True):
+        assert torch.equal(expected, found)
+
+
+def test_a_new_optimizer_after_growing_keeps_the_settings_of_the_site() -> None:
+    field = Field()
+    composition = [WeightDecay(LINES, decay=0.5), LearningRate(LINES, scale=Linear(1.0, 0.5))]
+    handle = gridreg.apply(field, *composition, total_steps=10)
+    handle.step(5)
+    with handle.suspended():
+        field.line = nn.Parameter(torch.randn(3, 9))
+    groups = handle.parameter_groups(groups_of(field))
+    (group,) = [g for g in groups if g["params"][0] is field.line]
+    assert group["weight_decay"] == 0.5
+    assert group["lr"] == pytest.approx(0.1 * 0.75)
