@@ -113,12 +113,14 @@ def _mark_ray(
         i = np.uint32(min(max(x, _ZERO_F), edge_x - _ONE_F))
         j = np.uint32(min(max(y, _ZERO_F), edge_y - _ONE_F))
         k = np.uint32(min(max(z, _ZERO_F), edge_z - _ONE_F))
-        if cells[i, j, k]:
-            bits[(index - 1) >> 6] |= _ONE << ((index - 1) & 63)
-            count += 1
-            continue
-        size = _ONE_F
-        if not coarse[i // _COARSE, j // _COARSE, k // _COARSE]:
+        # The coarse blocks first: they stay in the first-level cache.
+        if coarse[i // _COARSE, j // _COARSE, k // _COARSE]:
+            if cells[i, j, k]:
+                bits[(index - 1) >> 6] |= _ONE << ((index - 1) & 63)
+                count += 1
+                continue
+            size = _ONE_F
+        else:
             size = np.float32(_COARSE)
             i, j, k = i // _COARSE * _COARSE, j // _COARSE * _COARSE, k // _COARSE * _COARSE
         leave = (np.float32(i) + face_x * size - at_x) * rate_x
