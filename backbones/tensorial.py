@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from contextlib import AbstractContextManager
 from typing import Any
 
@@ -39,6 +40,17 @@ def density_shift_for(opacity: float, length: float, distance_scale: float) -> f
     return math.log(math.expm1(-math.log1p(-opacity) / (length * distance_scale)))
 
 
+@torch.no_grad()
+def _initialise(modules: Iterable[nn.Module], generator: torch.Generator | None) -> None:
+    """The default initial values of linear layers, drawn from a generator; the last bias of a decoder stays 0."""
+    for module in modules:
+        if isinstance(module, nn.Linear):
+            bound = module.in_features**-0.5
+            module.weight.uniform_(-bound, bound, generator=generator)
+            if module.bias is not None and bool(module.bias.any()):
+                module.bias.uniform_(-bound, bound, generator=generator)
+
+
 class TensorialField(nn.Module):
     """``density = distance_scale * softplus(G(x) + shift)``, ``colour = S(B A(x), d)`` (TensoRF, section 4.1).
 
@@ -53,6 +65,7 @@ class TensorialField(nn.Module):
         density_shift: added before the softplus; -10 in TensoRF. None: from ``initial_opacity``.
         initial_opacity: opacity of a ray along the mean edge of the box before training; used when there is no shift.
         distance_scale: factor on the density (25 in TensoRF).
+        generator: for the networks' initial values.
         decoder_options: of the decoder, such as ``width`` (128) and ``precision`` ("auto") of the MLPs.
     """
 
@@ -69,6 +82,7 @@ class TensorialField(nn.Module):
         density_shift: float | None = -10.0,
         initial_opacity: float = 0.1,
         distance_scale: float = 25.0,
+        generator: torch.Generator | None = None,
         **decoder_options: Any,
     ) -> None:
         super().__init__()
@@ -82,6 +96,7 @@ class TensorialField(nn.Module):
         self.resolution = resolution
         count, self.decoder = make_decoder(decoder, features, **decoder_options)
         self.basis = nn.Linear(appearance_channels, count, bias=False)
+        _initialise([self.basis, *self.decoder.modules()], generator)
         self.distance_scale = distance_scale
         if density_shift is None:
             length = float((bounds[1] - bounds[0]).mean())

@@ -45,7 +45,7 @@ class VMField(TensorialField):
         generator: torch.Generator | None = None,
         **options: Any,
     ) -> None:
-        super().__init__(bounds, resolution, 3 * appearance_components, **options)
+        super().__init__(bounds, resolution, 3 * appearance_components, generator=generator, **options)
         self.density_planes, self.density_lines = _grids(resolution, density_components, scale, generator)
         self.appearance_planes, self.appearance_lines = _grids(
             resolution, appearance_components, scale, generator
