@@ -53,6 +53,9 @@ class Slot:
         place = self.context.place
         if place is None or place.size is None:
             return
+        if prepare and not self.active and self.regularizer.is_over(self.context):
+            self.context.prepared_at = self.context.step
+            return
         if prepare:
             # A state made in inference mode could not be updated outside it.
             with torch.inference_mode(False):

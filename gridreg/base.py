@@ -150,6 +150,10 @@ class Regularizer:
         """True: `transform` is skipped until the next step. Asked after `prepare`."""
         return False
 
+    def is_over(self, context: Context) -> bool:
+        """True: from this step on it is the identity for good, so a slot that is idle already need not ask again."""
+        return False
+
     def open_channels(self, context: Context) -> int | None:
         """Channels at and beyond this index are exactly 0 after `transform`; None: no such tail."""
         return None

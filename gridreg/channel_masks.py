@@ -4,6 +4,7 @@ effect."""
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -56,7 +57,7 @@ class Mask(Regularizer):
         if context.place is None:
             raise InputError("context: a mask has one only at a place")
         ranks = self.ranks(context.place)
-        return self.rank_values(max(ranks) + 1, context)[list(ranks)]
+        return self.rank_values(max(ranks) + 1, context)[_indices(ranks)]
 
     def prepare(self, context: Context) -> None:
         """Keep the mask over all channels of the tensor in the state."""
@@ -65,6 +66,12 @@ class Mask(Regularizer):
     def is_identity(self, context: Context) -> bool:
         """Fully open."""
         return bool((context.state["mask"] == 1).all())
+
+    def is_over(self, context: Context) -> bool:
+        """Past its end."""
+        ranks = () if context.place is None else self.ranks(context.place)
+        end = self.end(max(ranks, default=0) + 1, context.total_steps)
+        return end is not None and context.step >= end
 
     def gradient_only(self) -> bool:
         """Whether values stay and only gradients change."""
@@ -105,12 +112,18 @@ class _ScaledGradient(torch.autograd.Function):
         return torch.where(mask > 0, gradient * mask, 0.0), None
 
 
+@lru_cache(maxsize=256)
+def _indices(values: tuple[int, ...]) -> Tensor:
+    """Indices as a tensor: made once, because masks are made at every step."""
+    return torch.tensor(values)
+
+
 def spread(values: Tensor, place: Place | None) -> Tensor:
     """Factors of the channels that take part, spread over all channels of the tensor; the others get 1."""
     if place is None or place.selected is None or place.size is None:
         return values
     factors = torch.ones(place.size)
-    factors[list(place.selected)] = values
+    factors[_indices(place.selected)] = values
     return factors
 
 
