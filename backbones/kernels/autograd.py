@@ -10,9 +10,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from backbones.kernels import vm, vm_gradient
+from backbones.kernels import cp, vm, vm_gradient
+from backbones.kernels.simd import LANES
 
-__all__ = ["accumulate_into_grad", "vm_density", "vm_features"]
+__all__ = ["accumulate_into_grad", "cp_density", "cp_features", "vm_density", "vm_features"]
 
 _local = threading.local()
 
@@ -58,7 +59,7 @@ def _gradient_buffers(planes: Sequence[Tensor], in_place: bool) -> tuple[list[Te
 
 
 class _Lookup(torch.autograd.Function):
-    """A lookup of VM grids with its compiled backward pass."""
+    """A lookup with its compiled backward pass; grids are planes, if any, and three lines."""
 
     @staticmethod
     def forward(
@@ -71,42 +72,62 @@ class _Lookup(torch.autograd.Function):
     ) -> Tensor:
         ctx.backward_pass, ctx.read = backward, read
         ctx.save_for_backward(u, *grids)
-        detached = [grid.detach().contiguous() for grid in grids]
-        return forward(u.detach().contiguous(), detached[:3], detached[3:], read)
+        return forward(u.detach().contiguous(), *_parts(grids), read)
 
     @staticmethod
     @torch.autograd.function.once_differentiable  # type: ignore[untyped-decorator]
     def backward(ctx: Any, upstream: Tensor) -> tuple[Any, ...]:
         u, *grids = ctx.saved_tensors
-        planes = grids[:3]
-        buffers, returned = _gradient_buffers(planes, getattr(_local, "in_place", False))
-        contiguous = [grid.detach().contiguous() for grid in grids]
+        buffers, returned = _gradient_buffers(grids[:-3], getattr(_local, "in_place", False))
         lines = ctx.backward_pass(
-            u.detach().contiguous(), contiguous[:3], contiguous[3:], ctx.read, upstream.contiguous(), buffers
+            u.detach().contiguous(),
+            *_parts(grids),
+            ctx.read,
+            upstream.contiguous(),
+            *([buffers] if buffers else []),
         )
         return (None, None, None, None, *returned, *lines)
 
 
-def _opened(lines: Sequence[Tensor], open_channels: int) -> tuple[list[Tensor], int]:
-    """Lines with closed channels set to 0, and how many channels to read, full vectors of them if there are as many."""
+def _parts(grids: Sequence[Tensor]) -> list[list[Tensor]]:
+    """Planes, if there are any, and lines, as kernels want them."""
+    contiguous = [grid.detach().contiguous() for grid in grids]
+    return [contiguous[:-3], contiguous[-3:]] if len(grids) > 3 else [contiguous]
+
+
+def _lookup(
+    forward: Callable[..., Tensor],
+    backward: Callable[..., Any],
+    u: Tensor,
+    planes: Sequence[Tensor],
+    lines: Sequence[Tensor],
+    open_channels: int,
+) -> Tensor:
     channels = lines[0].shape[1]
-    if open_channels >= channels:
-        return list(lines), channels
-    opened = [
-        torch.cat([line[:, :open_channels], torch.zeros_like(line[:, open_channels:])], 1) for line in lines
-    ]
-    return opened, min(channels, -(-open_channels // 8) * 8)
+    read = channels
+    if open_channels < channels:
+        # Whole vectors are read: closed channels among them must count as 0, and their gradient stops here.
+        read = min(channels, -(-open_channels // LANES) * LANES)
+        lines = [torch.cat([x[:, :open_channels], torch.zeros_like(x[:, open_channels:])], 1) for x in lines]
+    out: Tensor = _Lookup.apply(forward, backward, u, read, *planes, *lines)  # type: ignore[no-untyped-call]
+    return out
 
 
 def vm_density(u: Tensor, planes: Sequence[Tensor], lines: Sequence[Tensor], open_channels: int) -> Tensor:
     """See `backbones.kernels.vm_density`."""
-    lines, read = _opened(lines, open_channels)
-    out: Tensor = _Lookup.apply(vm.density, vm_gradient.density_backward, u, read, *planes, *lines)  # type: ignore[no-untyped-call]
-    return out
+    return _lookup(vm.density, vm_gradient.density_backward, u, planes, lines, open_channels)
 
 
 def vm_features(u: Tensor, planes: Sequence[Tensor], lines: Sequence[Tensor], open_channels: int) -> Tensor:
     """See `backbones.kernels.vm_features`."""
-    lines, read = _opened(lines, open_channels)
-    out: Tensor = _Lookup.apply(vm.features, vm_gradient.features_backward, u, read, *planes, *lines)  # type: ignore[no-untyped-call]
-    return out
+    return _lookup(vm.features, vm_gradient.features_backward, u, planes, lines, open_channels)
+
+
+def cp_density(u: Tensor, lines: Sequence[Tensor], open_channels: int) -> Tensor:
+    """See `backbones.kernels.cp_density`."""
+    return _lookup(cp.density, cp.density_backward, u, (), lines, open_channels)
+
+
+def cp_features(u: Tensor, lines: Sequence[Tensor], open_channels: int) -> Tensor:
+    """See `backbones.kernels.cp_features`."""
+    return _lookup(cp.features, cp.features_backward, u, (), lines, open_channels)

@@ -88,10 +88,14 @@ def vm_features(
 def cp_density(u: Tensor, lines: Sequence[Tensor], open_channels: int | None = None) -> Tensor:
     """Sum over channels of the product of three lines, ``(N,)``. Arguments as for `vm_density`."""
     _check(u, (), lines, open_channels)
+    if _takes_compiled(u, *lines):
+        return autograd.cp_density(u, lines, _count(lines, open_channels))
     return reference.cp_density(u, lines, open_channels)
 
 
 def cp_features(u: Tensor, lines: Sequence[Tensor], open_channels: int | None = None) -> Tensor:
     """Products of three lines, ``(N, C)``. Arguments as for `vm_density`."""
     _check(u, (), lines, open_channels)
+    if _takes_compiled(u, *lines):
+        return autograd.cp_features(u, lines, _count(lines, open_channels))
     return reference.cp_features(u, lines, open_channels)

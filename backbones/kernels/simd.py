@@ -82,10 +82,8 @@ def prefetch(context: Any, array: Any, index: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         pointer = _element(context, builder, signature, arguments, ir.IntType(8))
         word = ir.IntType(32)
-        function = builder.module.globals.get("llvm.prefetch.p0")
-        if function is None:
-            kind = ir.FunctionType(ir.VoidType(), [pointer.type, word, word, word])
-            function = ir.Function(builder.module, kind, "llvm.prefetch.p0")
+        kind = ir.FunctionType(ir.VoidType(), [pointer.type, word, word, word])
+        function = builder.module.declare_intrinsic("llvm.prefetch", (pointer.type,), kind)
         builder.call(function, [pointer, word(0), word(3), word(1)])
         return context.get_dummy_value()
 
