@@ -7,9 +7,11 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
+import gridreg
 from gridreg.export.cameras import look_at
+from gridreg.export.model import Model
 from gridreg.scenes import Views
 
 Function = Callable[[Tensor], Tensor]
@@ -94,3 +96,28 @@ def ring_of_views(
     intrinsics = torch.tensor([[focal, focal, size[1] / 2, size[0] / 2]]).repeat(count, 1)
     names = tuple(f"view_{i}" for i in range(count))
     return Views(torch.ones(count, *size, 4), torch.stack(poses), intrinsics, names, tuple(range(count)))
+
+
+class MaskedBall(nn.Module):
+    """A ball of radius 0.6, coloured ``(x + 1) / 2 @ weight``: masking rows of the weight takes colours."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.eye(3))
+        self.register_buffer("bounds", torch.tensor([[-1.0] * 3, [1.0] * 3]))
+
+    def density(self, x: Tensor) -> Tensor:
+        return 60.0 * (x.norm(dim=-1) < 0.6).float()
+
+    def colour(self, x: Tensor, d: Tensor) -> Tensor:
+        return ((x + 1) / 2) @ self.weight
+
+
+def ball_model(step: int, extra: tuple[gridreg.Regularizer, ...] = ()) -> Model:
+    """A `MaskedBall` with a mask that opens red, then green, then blue within 100 steps."""
+    field = MaskedBall()
+    mask = gridreg.FrequencyMask(gridreg.parameters("weight", dim=0), until=1.0, block=1)
+    handle = gridreg.apply(field, mask, *extra, total_steps=100)
+    handle.step(step)
+    plain = Model.of_field(field, resolution=24)
+    return Model(field, plain.occupancy, plain.march, plain.background, handle)

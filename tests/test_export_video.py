@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 import subprocess
 from pathlib import Path
@@ -20,7 +19,7 @@ from gridreg.export.camera_paths import camera_path
 from gridreg.export.cameras import Camera, Lens
 from gridreg.export.model import Model
 from gridreg.export.pictures import beside, colour_bar, depth_range, picture
-from gridreg.export.video import print_progress, render_frames, render_video
+from gridreg.export.video import render_frames, render_video
 from gridreg.export.writers import write_video
 from gridreg.rendering import Rendered
 from tests.export_fields import AnalyticField, ball, ring_of_views
@@ -310,24 +309,3 @@ class TestFfmpeg:
         assert len(started) == 1
         assert started[0].returncode is not None
         assert list(tmp_path.iterdir()) == []
-
-
-def test_progress_in_a_log_is_a_line_every_tenth():
-    log = io.StringIO()
-    for done in range(1, 41):
-        print_progress(done, 40, 2.0 * (40 - done), stream=log)
-    lines = log.getvalue().splitlines()
-    assert len(lines) == 10
-    assert lines[0] == "frame 4 of 40, 1:12 left"
-    assert lines[-1] == "frame 40 of 40, 0:00 left"
-
-
-def test_progress_on_a_terminal_is_one_line():
-    class Terminal(io.StringIO):
-        def isatty(self) -> bool:
-            return True
-
-    log = Terminal()
-    for done in (1, 2):
-        print_progress(done, 2, 61.0 * (2 - done), stream=log)
-    assert log.getvalue() == "\rframe 1 of 2, 1:01 left   \rframe 2 of 2, 0:00 left   \n"

@@ -7,7 +7,8 @@ from gridreg.export.compare import MeshComparison, compare_meshes
 from gridreg.export.mesh import Mesh, extract_mesh, read_mesh, save_mesh, write_mesh
 from gridreg.export.model import Model
 from gridreg.export.pictures import MODES, picture
-from gridreg.export.video import print_progress, render_frames, render_video
+from gridreg.export.video import render_frames, render_video
+from gridreg.export.viewer import Viewer
 
 __all__ = [
     "CAMERA_PATHS",
@@ -18,6 +19,7 @@ __all__ = [
     "MeshComparison",
     "Model",
     "Orbit",
+    "Viewer",
     "camera_path",
     "compare_meshes",
     "extract_mesh",
@@ -26,7 +28,6 @@ __all__ = [
     "orbit_of_box",
     "orbit_of_views",
     "picture",
-    "print_progress",
     "read_mesh",
     "render_frames",
     "render_video",

@@ -14,7 +14,7 @@ from torch import Tensor
 from gridreg.errors import InputError
 from gridreg.rendering import Rendered
 
-__all__ = ["MODES", "DepthRange", "beside", "check_mode", "colour_bar", "depth_range", "picture"]
+__all__ = ["MODES", "DepthRange", "beside", "check_mode", "colour_bar", "depth_range", "picture", "z_depth"]
 
 MODES = ("rgb", "depth", "opacity")
 """What can be seen of a render."""
@@ -25,6 +25,8 @@ Pixels = NDArray[np.uint8]
 _COLOURMAP = "turbo"
 # Depths of rays that hit next to nothing are noise.
 _SEEN = 0.05
+# World units; beyond what a field holds, within what the viewer's depth pictures can say.
+_FAR = 150.0
 
 
 def check_mode(mode: str) -> None:
@@ -129,3 +131,24 @@ def beside(pictures: Sequence[Pixels]) -> Pixels:
     height = max(p.shape[0] for p in pictures)
     padded = [np.pad(p, ((0, height - p.shape[0]), (0, 0), (0, 0)), constant_values=255) for p in pictures]
     return np.concatenate(padded, axis=1)
+
+
+def z_depth(rendered: Rendered, intrinsics: tuple[float, float, float, float]) -> NDArray[np.float32]:
+    """Mean depth along the optical axis, as depth buffers have it, far away where less than half is hit.
+
+    Args:
+        rendered: opacity and depth ``(H, W)``.
+        intrinsics: fx, fy, cx, cy in pixels.
+
+    Returns:
+        ``(H, W)`` world units.
+    """
+    fx, fy, cx, cy = intrinsics
+    height, width = rendered.depth.shape
+    x = (torch.arange(width) + 0.5 - cx) / fx
+    y = (torch.arange(height) + 0.5 - cy) / fy
+    slant = torch.sqrt(1 + x[None] ** 2 + y[:, None] ** 2)
+    opacity = rendered.opacity.cpu()
+    mean = rendered.depth.cpu() / opacity.clamp(min=1e-6) / slant
+    found: NDArray[np.float32] = mean.masked_fill(opacity <= 0.5, _FAR).numpy()
+    return found

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -17,23 +15,10 @@ from gridreg.export.pictures import DepthRange, Pixels, beside, check_mode, colo
 from gridreg.export.writers import check_target, write_video
 from gridreg.rendering import Rendered
 
-__all__ = ["Progress", "print_progress", "render_frames", "render_video"]
+__all__ = ["Progress", "render_frames", "render_video"]
 
 Progress = Callable[[int, int, float], None]
 """Told after every frame: frames done, frames in all, seconds left."""
-
-
-def print_progress(done: int, total: int, left: float, *, stream: Any = None) -> None:
-    """One line on the terminal: frames done and time left."""
-    stream = sys.stderr if stream is None else stream
-    minutes, seconds = divmod(round(left), 60)
-    text = f"frame {done} of {total}, {minutes}:{seconds:02d} left"
-    # A log file gets a line every tenth, a terminal one line that changes.
-    if stream.isatty():
-        stream.write(f"\r{text}   " + ("\n" if done == total else ""))
-    elif done == total or done * 10 // total != (done - 1) * 10 // total:
-        stream.write(text + "\n")
-    stream.flush()
 
 
 def render_video(

@@ -1,0 +1,128 @@
+"""What the viewer needs of viser: a server, the cameras of browsers, training cameras to look at."""
+
+from __future__ import annotations
+
+import math
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
+from torch import Tensor
+
+from gridreg.errors import InputError
+from gridreg.export.cameras import Camera, Lens
+from gridreg.scenes import Views
+
+__all__ = ["add_frustums", "camera_of", "picture_shape", "quiet_console", "start_server"]
+
+# The browser's cameras look along +z with y down (OpenCV).
+_FLIP = np.diag([1.0, -1.0, -1.0])
+_MOST_FRUSTUMS = 100
+
+
+@contextmanager
+def quiet_console() -> Iterator[None]:
+    """Keep viser from printing its own banners."""
+    import rich
+
+    console = rich.get_console()
+    before, console.quiet = console.quiet, True
+    try:
+        yield
+    finally:
+        console.quiet = before
+
+
+def start_server(host: str, port: int) -> Any:
+    """A ``viser.ViserServer`` on exactly this port (0: any free one).
+
+    Raises:
+        InputError: without viser, if the port is taken, or if the host is none of this machine's.
+    """
+    try:
+        import viser
+    except ImportError as error:
+        raise InputError("viewer: viser is not installed, expected: pip install 'gridreg[viewer]'") from error
+    if not 0 <= port <= 65535:
+        raise InputError(f"port={port}: expected a number from 0 to 65535")
+    # viser would silently take the next free port.
+    with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
+        try:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind((host, port))
+            port = probe.getsockname()[1]
+        except OSError as error:
+            reason = error.strerror or str(error)
+            raise InputError(
+                f"viewer: cannot listen on {host}:{port}: {reason}; choose another port"
+            ) from error
+    with quiet_console():
+        server = viser.ViserServer(host=host, port=port, label="gridreg", verbose=False)
+    if server.get_port() != port:
+        server.stop()
+        raise InputError(f"viewer: port {port} was taken meanwhile; choose another port")
+    server.gui.configure_theme(dark_mode=False, show_logo=False, show_share_button=False)
+    # A page could ask for a public address of this server; nobody here has agreed to that.
+    setattr(server, "request_share_url", lambda *_, **__: None)  # noqa: B010
+    return server
+
+
+def picture_shape(client: Any, size: int) -> tuple[int, int]:
+    """Height and width at rest of a client's picture: no more pixels than its window has."""
+    height, width = max(1, client.camera.image_height), max(1, client.camera.image_width)
+    factor = min(1.0, size / max(height, width))
+    return max(1, round(height * factor)), max(1, round(width * factor))
+
+
+def camera_of(client: Any, shape: tuple[int, int], width: int) -> Camera:
+    """The camera of a browser's window, for a picture of a width."""
+    camera = client.camera
+    height = max(1, round(shape[0] * width / shape[1]))
+    w, x, y, z = (float(v) for v in camera.wxyz)
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix() @ _FLIP
+    pose[:3, 3] = camera.position
+    focal = shape[0] / 2 / math.tan(float(camera.fov) / 2)
+    lens = Lens((focal * width / shape[1], focal * height / shape[0], width / 2, height / 2), height, width)
+    return Camera(torch.from_numpy(pose).float(), lens)
+
+
+def add_frustums(server: Any, views: Views, background: Tensor, depth: float) -> None:
+    """The cameras of views with their pictures ``depth`` world units before them; a click goes there."""
+    pictures = (views.composited(background.cpu()) * 255).round().to(torch.uint8).cpu().numpy()
+    stride = max(1, math.ceil(len(views) / _MOST_FRUSTUMS))
+    for i in range(0, len(views), stride):
+        small = Image.fromarray(pictures[i])
+        small.thumbnail((128, 128))
+        pose = views.poses[i].double().cpu().numpy()
+        x, y, z, w = Rotation.from_matrix(pose[:3, :3] @ _FLIP).as_quat()
+        half = views.height / 2 / float(views.intrinsics[i, 1])
+        aspect = views.width / views.height
+        # viser scales a frustum by its volume.
+        scale = depth * (half * half * aspect / 3) ** (1 / 3)
+        frustum = server.scene.add_camera_frustum(
+            f"/cameras/{views.names[i]}",
+            fov=2 * math.atan(half),
+            aspect=aspect,
+            scale=scale,
+            thickness=0.03 * depth,
+            image=np.asarray(small),
+            wxyz=(w, x, y, z),
+            position=pose[:3, 3],
+        )
+        frustum.on_click(_goes_to(pose))
+
+
+def _goes_to(pose: NDArray[np.float64]) -> Any:
+    def clicked(event: Any) -> None:
+        with event.client.atomic():
+            event.client.camera.position = pose[:3, 3]
+            event.client.camera.look_at = pose[:3, 3] - np.linalg.norm(pose[:3, 3]) * pose[:3, 2]
+
+    return clicked
