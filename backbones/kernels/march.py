@@ -3,7 +3,7 @@ space."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -24,7 +24,7 @@ from backbones.kernels.compiler import (
 from backbones.kernels.threading import launch
 from gridreg.rendering.plain import CELL_TOLERANCE, steps_bound
 
-__all__ = ["march"]
+__all__ = ["Marked", "mark", "march"]
 
 # Edge, in cells, of the blocks that are skipped whole when nothing in them is occupied.
 _COARSE = np.uint32(4)
@@ -200,6 +200,55 @@ def _fill(table: Any) -> None:
                 )
 
 
+class Marked(NamedTuple):
+    """The samples of a march before they are written out.
+
+    Args:
+        origins, directions: ``(R, 3)``, contiguous.
+        near, shift: ``(R,)``; sample ``index`` lies at ``near + (index + shift) * step``.
+        bits: ``(R, words)`` int64; bit i of word w is set if index ``64 w + i`` is kept.
+        offsets: ``(R + 1,)`` int64; the samples of ray r are ``offsets[r] : offsets[r + 1]``.
+    """
+
+    origins: Tensor
+    directions: Tensor
+    near: Tensor
+    shift: Tensor
+    bits: Tensor
+    offsets: Tensor
+
+
+@torch.no_grad()
+def mark(
+    origins: Tensor,
+    directions: Tensor,
+    t_min: Tensor,
+    t_max: Tensor,
+    step: float,
+    cells: Tensor,
+    bounds: Tensor,
+    jitter: Tensor | float,
+) -> Marked:
+    """Find the samples of a march; arguments as of `march`."""
+    rays = origins.shape[0]
+    steps = steps_bound(t_min, t_max, step)
+    o, d, near, far = (x.contiguous() for x in (origins, directions, t_min, t_max))
+    shift = torch.as_tensor(jitter, dtype=torch.float32).expand(rays).contiguous()
+    grid = cells.contiguous().view(torch.uint8)
+    shape = torch.tensor(grid.shape)
+    box = torch.stack([bounds[0], shape.to(bounds.dtype) / (bounds[1] - bounds[0])])
+    coarse = torch.empty(*(-(-n // int(_COARSE)) for n in grid.shape), dtype=torch.uint8)
+    columns = torch.empty(coarse.shape[0], grid.shape[2], dtype=torch.uint8)
+    bits, counts = torch.zeros(rays, -(-steps // 64), dtype=torch.int64), torch.zeros(rays, dtype=torch.int64)
+    tasks = -(-rays // _RAYS)
+
+    launch(_coarsen, coarse.shape[0] if steps else 0, grid, coarse, columns)
+    launch(_mark, tasks if steps else 0, o, d, near, far, shift, step, grid, coarse, box, bits, counts)
+    offsets = torch.zeros(rays + 1, dtype=torch.int64)
+    torch.cumsum(counts, 0, out=offsets[1:])
+    return Marked(o, d, near, shift, bits, offsets)
+
+
 @torch.no_grad()
 def march(
     origins: Tensor,
@@ -217,30 +266,25 @@ def march(
     (Amanatides and Woo 1987), so the cost follows the number of cells that a ray meets near surfaces; samples
     stay on the lattice.
     """
-    rays = origins.shape[0]
-    steps = steps_bound(t_min, t_max, step)
-    if steps == 0:
-        offsets, empty = torch.zeros(rays + 1, dtype=torch.int64), torch.zeros(0)
-        return offsets, offsets[:0].clone(), empty, empty.reshape(0, 3)
-    o, d, near, far = (x.contiguous() for x in (origins, directions, t_min, t_max))
-    shift = torch.as_tensor(jitter, dtype=torch.float32).expand(rays).contiguous()
-    grid = cells.contiguous().view(torch.uint8)
-    shape = torch.tensor(grid.shape)
-    box = torch.stack([bounds[0], shape.to(bounds.dtype) / (bounds[1] - bounds[0])])
-    coarse = torch.empty(*(-(-n // int(_COARSE)) for n in grid.shape), dtype=torch.uint8)
-    columns = torch.empty(coarse.shape[0], grid.shape[2], dtype=torch.uint8)
-    bits, counts = torch.zeros(rays, -(-steps // 64), dtype=torch.int64), torch.empty(rays, dtype=torch.int64)
-    tasks = -(-rays // _RAYS)
-
-    launch(_coarsen, coarse.shape[0], grid, coarse, columns)
-    launch(_mark, tasks, o, d, near, far, shift, step, grid, coarse, box, bits, counts)
-    offsets = torch.zeros(rays + 1, dtype=torch.int64)
-    torch.cumsum(counts, 0, out=offsets[1:])
+    o, d, near, shift, bits, offsets = mark(origins, directions, t_min, t_max, step, cells, bounds, jitter)
     samples = int(offsets[-1])
     index, t, positions = (
         torch.empty(samples, dtype=torch.int64),
         torch.empty(samples),
         torch.empty(samples, 3),
     )
-    launch(_fill, tasks if samples else 0, o, d, near, shift, step, bits, offsets, index, t, positions)
+    launch(
+        _fill,
+        -(-o.shape[0] // _RAYS) if samples else 0,
+        o,
+        d,
+        near,
+        shift,
+        step,
+        bits,
+        offsets,
+        index,
+        t,
+        positions,
+    )
     return offsets, index, t, positions
