@@ -9,12 +9,15 @@ from gridreg.scenes.builtin import (
     builtin_signed_distance,
     builtin_surface,
 )
+from gridreg.scenes.llff import ndc_rays
 from gridreg.scenes.load import load_scene
+from gridreg.scenes.prepare import Prepared, prepare
 from gridreg.scenes.protocols import PROTOCOLS, Protocol, get_protocol
 from gridreg.scenes.views import Scene, Views, background_colour
 
 __all__ = [
     "PROTOCOLS",
+    "Prepared",
     "Protocol",
     "Scene",
     "Views",
@@ -26,4 +29,6 @@ __all__ = [
     "builtin_surface",
     "get_protocol",
     "load_scene",
+    "ndc_rays",
+    "prepare",
 ]

@@ -12,7 +12,7 @@ from gridreg.scenes.colmap_model import ColmapCamera, ColmapImage, ColmapModel, 
 from gridreg.scenes.frames import Camera, Frame, SceneFiles, check_pose
 from gridreg.scenes.lens import Distortion
 
-__all__ = ["camera_to_world", "find_models", "frames_of_model", "read_colmap"]
+__all__ = ["camera_to_world", "find_models", "frames_of_model", "mask_of", "read_colmap"]
 
 _PLACES = ("sparse", "colmap/sparse", ".")
 
@@ -74,7 +74,7 @@ def frames_of_model(model: ColmapModel, folder: Path, pictures: str, where: str)
             pose=camera_to_world(image, f"{where}: image {image.name}"),
             camera=_to_camera(model.cameras[image.camera_id]),
             where=f"{where}: image {image.name}",
-            mask_path=_mask_path(masks, image.name) if masks.is_dir() else None,
+            mask_path=f"masks/{mask_of(masks, image.name)}" if masks.is_dir() else None,
         )
         for image in model.images
     ]
@@ -119,8 +119,13 @@ def _to_camera(camera: ColmapCamera) -> Camera:
     )
 
 
-def _mask_path(masks: Path, name: str) -> str:
+def mask_of(masks: Path, name: str) -> str:
+    """Return the name of the mask in a folder that belongs to the image ``name``.
+
+    Raises:
+        InputError: when there is none.
+    """
     for candidate in (name, f"{name}.png", str(Path(name).with_suffix(".png"))):
         if (masks / candidate).is_file():
-            return f"masks/{candidate}"
+            return candidate
     raise InputError(f"{masks}: no mask for image {name}, expected {name}.png")

@@ -83,8 +83,9 @@ def blender_extent(
 def points_extent(poses: NDArray[np.float64], points: NDArray[np.float64]) -> Extent:
     """Derive the box from points known to lie on surfaces, such as those of structure from motion.
 
-    The box holds the middle 98 % of them along each axis, and a tenth of its edge more on each side; near
-    and far are the least and greatest depths at which cameras see points of the box, with a tenth of slack.
+    The box holds the middle 99 % of them along each axis and, on every side, 15 % of its longest edge more;
+    near and far are the least and greatest distances at which cameras see points of the box, with a tenth of
+    slack.
 
     Args:
         poses: ``(V, 4, 4)`` camera-to-world.
@@ -93,8 +94,9 @@ def points_extent(poses: NDArray[np.float64], points: NDArray[np.float64]) -> Ex
     Raises:
         InputError: when no camera has a point before it.
     """
-    low, high = np.quantile(points, [0.01, 0.99], axis=0)
-    margin = 0.1 * np.maximum(high - low, 0.1 * (high - low).max() + 1e-6)
+    low, high = np.quantile(points, [0.005, 0.995], axis=0)
+    # The same on every side: thin and plain parts that points miss may stick out of any of them.
+    margin = 0.15 * float((high - low).max()) + 1e-6
     bounds = np.stack([low - margin, high + margin])
     inside = points[((points >= bounds[0]) & (points <= bounds[1])).all(axis=1)]
     offset = inside[None] - poses[:, None, :3, 3]

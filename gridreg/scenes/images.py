@@ -15,7 +15,7 @@ from PIL import Image
 from gridreg.errors import InputError
 from gridreg.scenes.png16 import decode_png16, is_png16
 
-__all__ = ["area_mean", "read_mask", "read_rgba", "upright"]
+__all__ = ["area_mean", "copy_upright", "read_mask", "read_rgba", "upright"]
 
 _DECODER_ERRORS = (
     OSError,
@@ -134,21 +134,59 @@ def _one_line(error: Exception, path: Path) -> str:
 def _decode(data: bytes, path: Path, stated: tuple[int, int] | None, as_stored: bool) -> NDArray[np.float32]:
     """Decode to ``(H, W, 3)`` or ``(H, W, 4)``, whichever the file holds."""
     with Image.open(io.BytesIO(data)) as opened:
-        image: Image.Image = opened
-        # Pillow reads a PNG to its end to find EXIF data: a cut image has to fail before.
-        opened.load()
-        turned = upright(opened, path)
-        if turned != 1:
-            sideways = turned >= 5 and opened.width != opened.height
-            keep = opened.size == stated if sideways and stated is not None else as_stored
-            if not keep:
-                image = opened.transpose(_TURNS[turned])
+        image, _ = _turned(opened, path, stated, as_stored)
         if image.mode.startswith("I;16"):
             grey: NDArray[np.float32] = np.divide(np.asarray(image), 65535, dtype=np.float32)
             return np.repeat(grey[..., None], 3, axis=-1)
-        mode = "RGBA" if image.has_transparency_data else "RGB"
+        mode = "RGBA" if opened.has_transparency_data else "RGB"
         pixels: NDArray[np.float32] = np.divide(np.asarray(image.convert(mode)), 255, dtype=np.float32)
         return pixels
+
+
+def _turned(
+    opened: Image.Image, path: Path, stated: tuple[int, int] | None, as_stored: bool
+) -> tuple[Image.Image, bool]:
+    """Return an opened image as its camera saw it, and whether its EXIF data say that it is stored turned."""
+    # Pillow reads a PNG to its end to find EXIF data: a cut image has to fail before.
+    opened.load()
+    orientation = upright(opened, path)
+    if orientation == 1:
+        return opened, False
+    sideways = orientation >= 5 and opened.width != opened.height
+    keep = opened.size == stated if sideways and stated is not None else as_stored
+    return (opened if keep else opened.transpose(_TURNS[orientation])), True
+
+
+def copy_upright(
+    path: Path, target: Path, *, stated: tuple[int, int] | None = None, as_stored: bool = False
+) -> tuple[int, int]:
+    """Copy an image to where nothing but its pixels says which way is up, and return its width and height.
+
+    Bytes are copied where they can be; a JPEG that is stored turned is encoded anew at quality 95.
+
+    Args:
+        path: the image.
+        target: where to write it, with the same extension.
+        stated: see :func:`read_rgba`.
+        as_stored: see :func:`read_rgba`.
+
+    Raises:
+        InputError: when the image cannot be read.
+    """
+    data = _read_bytes(path)
+    try:
+        with Image.open(io.BytesIO(data)) as opened:
+            image, anew = _turned(opened, path, stated, as_stored)
+            size = image.size
+            if anew:
+                image.info.clear()
+    except _DECODER_ERRORS as error:
+        raise _not_whole(path, error) from None
+    if anew:
+        image.save(target, quality=95)
+    else:
+        target.write_bytes(data)
+    return size
 
 
 def area_mean(image: NDArray[np.float32], factor: int) -> NDArray[np.float32]:

@@ -21,7 +21,7 @@ from gridreg.scenes.reader import ViewReader
 from gridreg.scenes.transforms import read_transforms
 from gridreg.scenes.views import Scene, Views, background_colour
 
-__all__ = ["BUILTIN_MARKER", "load_scene", "read_folder"]
+__all__ = ["BUILTIN_MARKER", "NotASceneError", "load_scene", "read_folder"]
 
 BUILTIN_MARKER = "builtin.json"
 """File that marks a folder as the built-in scene."""
@@ -99,6 +99,10 @@ def load_scene(
     return scene
 
 
+class NotASceneError(InputError):
+    """A folder that is in none of the known formats."""
+
+
 def read_folder(folder: Path) -> SceneFiles:
     """Recognise the format of a scene folder and read its frame lists, without opening an image.
 
@@ -115,7 +119,7 @@ def read_folder(folder: Path) -> SceneFiles:
         return read_llff(folder)
     if find_models(folder):
         return read_colmap(folder)
-    raise InputError(
+    raise NotASceneError(
         f"{folder}: not a scene, expected transforms_train.json and transforms_test.json, transforms.json, "
         "poses_bounds.npy or a COLMAP model in sparse/0"
     )

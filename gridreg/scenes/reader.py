@@ -112,4 +112,6 @@ def _unique_names(folder: Path, paths: list[Path]) -> tuple[str, ...]:
     if len(set(stems)) == len(stems):
         return tuple(stems)
     root = folder.resolve()
-    return tuple("_".join(path.relative_to(root).with_suffix("").parts) for path in paths)
+    places = [path.relative_to(root) for path in paths]
+    joined = ["_".join(place.with_suffix("").parts) for place in places]
+    return tuple(joined if len(set(joined)) == len(joined) else ["_".join(place.parts) for place in places])

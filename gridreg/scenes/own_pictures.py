@@ -1,0 +1,154 @@
+"""Own pictures: gathering them in a scene folder, and cameras for them by structure from motion."""
+
+from __future__ import annotations
+
+import importlib.util
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from gridreg.errors import InputError
+from gridreg.scenes import structure_from_motion
+from gridreg.scenes.colmap import frames_of_model, mask_of
+from gridreg.scenes.colmap_model import read_model
+from gridreg.scenes.frames import Frame, SceneFiles, resolve_inside
+from gridreg.scenes.images import copy_upright, read_rgba
+
+__all__ = ["attach_masks", "copy_frames", "copy_pictures", "find_cameras"]
+
+Progress = Callable[[str], None]
+
+_PICTURES = (".png", ".jpg", ".jpeg")
+_FEWEST = 4
+_ADVICE = (
+    "take more pictures, each sharing two thirds of its view with its neighbours, sharp, without zooming, "
+    "of things with texture (a newspaper under the object helps)"
+)
+
+
+def copy_pictures(source: Path, scene: Path) -> list[str]:
+    """Copy the pictures of a folder upright into ``scene/images`` and return their names.
+
+    Raises:
+        InputError: for a folder without pictures, a damaged one, or pictures of different sizes.
+    """
+    pictures = sorted(
+        path for path in source.iterdir() if path.suffix.lower() in _PICTURES and path.is_file()
+    )
+    if not pictures:
+        others = sorted({path.suffix for path in source.iterdir() if path.is_file() and path.suffix})
+        found = f"only {', '.join(others)} files" if others else "nothing"
+        raise InputError(f"{source}: found {found}, expected pictures (.jpg or .png)")
+    if len(pictures) < _FEWEST:
+        raise InputError(f"{source}: found {len(pictures)} pictures, expected at least {_FEWEST}; {_ADVICE}")
+    first: tuple[int, int] | None = None
+    for path in pictures:
+        size = copy_upright(path, scene / "images" / path.name)
+        first = first or size
+        if size != first:
+            raise InputError(
+                f"{path}: picture is {size[0]}x{size[1]} upright, expected {first[0]}x{first[1]} as "
+                f"{pictures[0].name}: all pictures share one camera"
+            )
+    return [path.name for path in pictures]
+
+
+def find_cameras(
+    scene: Path, names: list[str], scratch: Path, progress: Progress
+) -> tuple[list[Frame], NDArray[np.float64] | None]:
+    """Find the cameras of the pictures in ``scene/images`` by pycolmap.
+
+    Returns:
+        Frames of the registered pictures, and ``(P, 3)`` points on surfaces, in the world of the model.
+
+    Raises:
+        InputError: when pycolmap is missing or fails, or fewer than half of the pictures (or 4) got a camera.
+    """
+    if importlib.util.find_spec("pycolmap") is None:
+        raise InputError(
+            "pycolmap is not installed: pip install 'gridreg[colmap]', or give a folder with a COLMAP model"
+        )
+    flat = scratch / "flat"
+    flat.mkdir()
+    for name in names:
+        _write_opaque(scene / "images" / name, flat / name)
+    log = scratch / "log.txt"
+    registered = 0
+    with log.open("wb") as errors:
+        command = [sys.executable, structure_from_motion.__file__, str(flat), str(scratch)]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True) as worker:
+            for line in worker.stdout or ():
+                stage, *count = line.split()
+                if stage == "registered":
+                    registered = int(count[0])
+                elif stage in structure_from_motion.STAGES:
+                    progress(stage)
+    if worker.returncode != 0:
+        last = (log.read_text(errors="replace").strip().splitlines() or ["no message"])[-1]
+        raise InputError(f"pycolmap failed with status {worker.returncode}: {last}")
+    if registered < max(_FEWEST, len(names) / 2):
+        raise InputError(f"only {registered} of {len(names)} pictures could be registered; {_ADVICE}")
+    model = read_model(scratch / "model")
+    frames = frames_of_model(model, scene, "images", "pycolmap")
+    return frames, model.points if len(model.points) else None
+
+
+def _write_opaque(path: Path, target: Path) -> None:
+    """Give features nothing to hold on to where a picture is transparent: a flat grey."""
+    rgba = read_rgba(path, opaque=True)
+    if (rgba[..., 3] == 1).all():
+        target.write_bytes(path.read_bytes())
+        return
+    flat = rgba[..., :3] * rgba[..., 3:] + 0.5 * (1 - rgba[..., 3:])
+    Image.fromarray(np.rint(255 * flat).astype(np.uint8)).save(target)
+
+
+def copy_frames(files: SceneFiles, scene: Path) -> list[Frame]:
+    """Copy the pictures and masks of a scene with cameras into another folder and return frames that name
+    them there.
+
+    Raises:
+        InputError: for a picture or mask that is missing or damaged, or outside of its scene.
+    """
+    frames = sorted([*files.train, *files.test], key=lambda frame: frame.file_path)
+    paths = [resolve_inside(files.folder, frame.file_path, frame.where) for frame in frames]
+    names = [path.name for path in paths]
+    if len(set(names)) != len(names):
+        names = ["_".join(path.relative_to(files.folder.resolve()).parts) for path in paths]
+    copied = []
+    for frame, path, name in zip(frames, paths, names, strict=True):
+        copy_upright(path, scene / "images" / name, stated=frame.camera.size, as_stored=files.as_stored)
+        mask_path = None
+        if frame.mask_path is not None:
+            mask = resolve_inside(files.folder, frame.mask_path, frame.where)
+            mask_path = _copy_mask(mask, scene, name)
+        copied.append(replace(frame, file_path=f"images/{name}", mask_path=mask_path))
+    return copied
+
+
+def attach_masks(frames: list[Frame], masks: Path, scene: Path) -> list[Frame]:
+    """Copy a mask for every frame from a folder of masks and return frames that name them.
+
+    Raises:
+        InputError: for a mask that is missing or damaged.
+    """
+    named = []
+    for frame in frames:
+        name = Path(frame.file_path).name
+        mask = mask_of(masks, name)
+        named.append(replace(frame, mask_path=_copy_mask(masks / mask, scene, name)))
+    return named
+
+
+def _copy_mask(mask: Path, scene: Path, name: str) -> str:
+    """Copy the mask of the picture ``name`` into ``scene/masks`` and return its path there."""
+    (scene / "masks").mkdir(exist_ok=True)
+    place = f"masks/{name}{mask.suffix}"
+    copy_upright(mask, scene / place)
+    return place
