@@ -1,0 +1,126 @@
+"""Pictures of masks: what a field gets to see of a grid of ones, at every step of a run."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import nn
+
+import gridreg
+from drawing.svg import ridges
+
+TOTAL = 600
+STEPS = np.arange(TOTAL + 1)
+SHARES = STEPS / TOTAL
+
+
+class Ones(nn.Module):
+    """A grid of ones, ``(channels, 4)``."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.grid = nn.Parameter(torch.ones(channels, 4))
+
+
+def seen(
+    *regularizers: gridreg.Regularizer, channels: int, steps: NDArray[np.int64] = STEPS
+) -> NDArray[np.float64]:
+    """What the field sees of ones at ``(channels, steps)``, through regularizers attached to ``grid``."""
+    field = Ones(channels)
+    columns = []
+    with gridreg.apply(field, *regularizers, total_steps=TOTAL) as handle, torch.no_grad():
+        for step in steps.tolist():
+            handle.step(step)
+            columns.append(field.grid[:, 0].double().numpy())
+    return np.stack(columns, axis=1)
+
+
+def site(octaves: Sequence[int] | None = None) -> gridreg.Selector:
+    """The grid of `Ones`."""
+    return gridreg.parameters("grid", dim=0, octaves=octaves)
+
+
+def by_octave(octaves: Sequence[int]) -> list[int]:
+    """A colour for each octave, grey for what is encoded itself."""
+    return [5 if octave < 0 else 1 + octave % 4 for octave in octaves]
+
+
+def encoding_labels(coordinates: str, octaves: Sequence[int]) -> list[str]:
+    """Names of the channels of an encoding in the order of coordinates."""
+    count = max(octaves) + 1
+    factors = ["" if k == 0 else str(2**k) for k in range(count)]
+    waves = [
+        f"{wave} {factor}{axis}" for wave in ("sin", "cos") for axis in coordinates for factor in factors
+    ]
+    return [*coordinates, *waves]
+
+
+def pictures() -> dict[str, str]:
+    """SVG text by name."""
+    coordinate = gridreg.octaves_of_channels(2, 4, "coordinate")
+    octave = gridreg.octaves_of_channels(2, 4, "octave")
+    levels = [level for level in range(8) for _ in range(2)]
+    bands = gridreg.spherical_bands(9)
+    drawn = {
+        "mask-frequency": ridges(
+            "FrequencyMask(until=0.9) by channel",
+            seen(gridreg.FrequencyMask(site(), until=0.9), channels=18),
+            SHARES,
+        ),
+        "mask-octaves": ridges(
+            "FrequencyMask(until=0.9) by octave",
+            seen(gridreg.FrequencyMask(site(coordinate), until=0.9), channels=18),
+            SHARES,
+            y_label="",
+            series=by_octave(coordinate),
+            labels=encoding_labels("xy", coordinate),
+        ),
+        "mask-fixed": ridges(
+            "FixedMask(visible_ratio=0.8)",
+            seen(gridreg.FixedMask(site(), visible_ratio=0.8), channels=18),
+            SHARES,
+        ),
+        "mask-cosine": ridges(
+            "CosineMask(until=0.9) by octave",
+            seen(gridreg.CosineMask(site(octave), until=0.9), channels=18),
+            SHARES,
+            series=by_octave(octave),
+        ),
+        "mask-level": ridges(
+            "LevelMask(start=2, every=0.1)",
+            seen(gridreg.LevelMask(site(), start=2, every=0.1), channels=16),
+            SHARES,
+            series=by_octave(levels),
+        ),
+        "mask-view": ridges(
+            "ViewDependenceMask(bands=2, until=0.7)",
+            seen(gridreg.ViewDependenceMask(site(), bands=2, until=0.7), channels=9),
+            SHARES,
+            y_label="coefficient",
+            series=by_octave(bands),
+            row=17,
+        ),
+        "mask-two": ridges(
+            "FrequencyMask and FixedMask on one site",
+            seen(
+                gridreg.FrequencyMask(site(), until=0.9),
+                gridreg.FixedMask(site(), visible_ratio=0.8),
+                channels=18,
+            ),
+            SHARES,
+        ),
+    }
+    coarse = np.arange(0, TOTAL + 1, 12)
+    # A draw holds until the next step.
+    held = np.repeat(coarse, 2)[1:]
+    draws = seen(gridreg.ComponentDropout(site()), channels=10, steps=coarse)
+    drawn["mask-dropout"] = ridges(
+        "ComponentDropout(): p from 0 to 0.2",
+        np.repeat(draws, 2, axis=1)[:, :-1] / 1.25,
+        held / TOTAL,
+        row=16,
+    )
+    return drawn
