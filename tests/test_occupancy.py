@@ -131,8 +131,10 @@ def test_visual_hull_holds_the_object_and_little_else(centre):
     assert not bool(hull[distance > 0.85].any())
 
 
-def test_what_no_view_sees_is_not_carved():
+def test_beyond_the_edge_of_a_picture_nothing_is_carved_if_the_silhouette_touches_it():
     intrinsics = torch.tensor([[400.0, 400.0, 20.0, 20.0]])
-    hull = visual_hull(OccupancyGrid.full(BOX, (16, 16, 16)), torch.zeros(1, 40, 40), poses_around(1), intrinsics)
-    # A narrow camera sees an empty tube; all else stays.
-    assert 0.5 < hull.float().mean() < 1.0
+    grid, alpha = OccupancyGrid.full(BOX, (16, 16, 16)), torch.zeros(1, 40, 40)
+    assert not bool(visual_hull(grid, alpha, poses_around(1), intrinsics).any())
+    alpha[0, 0, 7] = 1.0
+    # A narrow camera sees a tube that is almost empty; all else stays.
+    assert 0.5 < visual_hull(grid, alpha, poses_around(1), intrinsics).float().mean() < 1.0

@@ -42,7 +42,9 @@ def test_opacity_and_colour_of_a_homogeneous_ball(radius, density, offset):
     field = Sphere(radius, density)
     grid = OccupancyGrid.full(field.bounds, (8, 8, 8))
     step = 1e-3
-    out = render_rays(field, parallel_rays(torch.tensor([offset])), grid, March(step, **EXACT), background=WHITE)
+    out = render_rays(
+        field, parallel_rays(torch.tensor([offset])), grid, March(step, **EXACT), background=WHITE
+    )
     chord = 2 * math.sqrt(max(0.0, radius**2 - offset**2))
     opacity = 1 - math.exp(-density * chord)
     # Both ends of the chord are met to within a step.
@@ -56,7 +58,9 @@ def test_opacity_and_colour_of_a_homogeneous_ball(radius, density, offset):
 def test_depth_of_a_homogeneous_ball(density, offset):
     field = Sphere(1.0, density)
     grid = OccupancyGrid.full(field.bounds, (8, 8, 8))
-    out = render_rays(field, parallel_rays(torch.tensor([offset])), grid, March(1e-3, **EXACT), background=WHITE)
+    out = render_rays(
+        field, parallel_rays(torch.tensor([offset])), grid, March(1e-3, **EXACT), background=WHITE
+    )
     half = math.sqrt(1 - offset**2)
     enter, chord = 3.0 - half, 2 * half
     # int_0^L (a + s) sigma exp(-sigma s) ds
@@ -92,7 +96,9 @@ def test_early_termination_changes_a_pixel_by_at_most_its_bound(bound, density):
     grid = OccupancyGrid.full(field.bounds, (8, 8, 8))
     rays = parallel_rays(torch.linspace(-1.3, 1.3, 27))
     exact = render_rays(field, rays, grid, March(0.02, **EXACT), background=WHITE)
-    cut = render_rays(field, rays, grid, March(0.02, transmittance_bound=bound, weight_bound=0.0), background=WHITE)
+    cut = render_rays(
+        field, rays, grid, March(0.02, transmittance_bound=bound, weight_bound=0.0), background=WHITE
+    )
     assert (exact.colour - cut.colour).abs().max() <= bound + 1e-5
     assert len(cut.samples) <= len(exact.samples)
 

@@ -56,14 +56,15 @@ def parameters(trainer):
 
 
 def test_training_learns_and_walks_through_its_events(scene, config):
-    trainer = build_trainer(config, scene)
+    trainer = build_trainer(replace(config, composition=[], train=TINY.scaled(90)), scene)
     first = trainer.train_step()["mse"]
     box = trainer.field.bounds.clone()
-    trainer.train()
-    assert trainer.step == 30
+    errors = []
+    trainer.train(each=lambda report: errors.append(report["mse"]) is None)
+    assert trainer.step == 90
     assert trainer.field.resolution == resolution_of(20**3, trainer.field.bounds)
     assert bool((trainer.field.bounds[0] >= box[0]).all())
-    assert trainer.train_step()["mse"] < first / 2
+    assert sum(errors[-5:]) / 5 < 0.8 * first
 
 
 def test_the_same_seed_gives_the_same_numbers(scene, config):
@@ -110,7 +111,15 @@ def test_a_resumed_run_ends_bit_for_bit_like_an_uninterrupted_one(scene, config,
 def test_what_a_run_leaves_behind(scene, config, tmp_path):
     run, metrics = execute(config, scene, tmp_path / "out", command=["train"])
     names = {p.name for p in (tmp_path / "out").iterdir()}
-    assert {"config.yaml", "checkpoint", "metrics.json", "test", "test.png", "curves.png", "masks.png"} <= names
+    assert {
+        "config.yaml",
+        "checkpoint",
+        "metrics.json",
+        "test",
+        "test.png",
+        "curves.png",
+        "masks.png",
+    } <= names
     stored = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert stored["benchmark"] is False
     assert stored["protocol"] == "builtin8"
@@ -133,14 +142,14 @@ def test_a_finished_or_foreign_run_is_not_overwritten(scene, config, tmp_path):
         execute(other, scene, tmp_path / "out", resume=True)
 
 
-def test_a_loss_that_is_not_finite_names_the_step_and_the_checkpoint(scene, config, tmp_path):
+def test_parameters_that_are_not_finite_are_never_saved(scene, config, tmp_path):
     saved = replace(config, train=replace(config.train, checkpoint_minutes=0.0))
 
     def spoil(report):
         steps.append(0)
         if len(steps) == 5:
             with torch.no_grad():
-                fields[0].density_lines[0].fill_(float("nan"))
+                dict(fields[0].named_parameters())["density_lines.0"].fill_(float("nan"))
 
     steps, fields = [], []
     original = gridreg.apply
@@ -151,10 +160,23 @@ def test_a_loss_that_is_not_finite_names_the_step_and_the_checkpoint(scene, conf
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(gridreg, "apply", remember)
-        with pytest.raises(InputError, match=r"step 5: the loss is nan.*last good checkpoint is .*checkpoint"):
+        with pytest.raises(
+            InputError, match=r"step 5: density_lines.0 is not finite.*last good .* is .*checkpoint"
+        ):
             execute(saved, scene, tmp_path / "out", on_step=spoil)
     # The checkpoint is the one before the step that failed.
     assert load_run(tmp_path / "out").step == 4
+
+
+def test_a_loss_that_is_not_finite_names_its_step_and_touches_no_parameter(scene, config):
+    trainer = build_trainer(config, scene)
+    trainer.train(until=3)
+    with torch.no_grad():
+        dict(trainer.field.named_parameters())["density_lines.0"].fill_(float("nan"))
+    before = parameters(trainer)["density_planes.0"]
+    with pytest.raises(InputError, match="step 3: the loss is nan"):
+        trainer.train_step()
+    assert torch.equal(parameters(trainer)["density_planes.0"], before)
 
 
 def test_an_empty_occupancy_says_so(scene, config):

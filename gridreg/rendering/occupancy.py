@@ -149,10 +149,14 @@ def _footprint(total: Tensor, row: Tensor, column: Tensor, radius: Tensor) -> Te
     return total[bottom, right] - total[top, right] - total[bottom, left] + total[top, left]
 
 
-def _alpha_views(alpha: Tensor, poses: Tensor, intrinsics: Tensor) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    for mask, pose, camera in zip(alpha, poses, intrinsics, strict=True):
-        total = F.pad((mask > 0).long().cumsum(0).cumsum(1), (1, 0, 1, 0))
-        yield total, torch.linalg.inv(pose.double()), camera.double()
+def _alpha_views(
+    alpha: Tensor, poses: Tensor, intrinsics: Tensor
+) -> Iterator[tuple[Tensor, bool, Tensor, Tensor]]:
+    """Of each view: summed-area table of its silhouette, whether that is whole, world-to-camera, intrinsics."""
+    for mask, pose, camera in zip(alpha > 0, poses, intrinsics, strict=True):
+        total = F.pad(mask.long().cumsum(0).cumsum(1), (1, 0, 1, 0))
+        cut = mask[0].any() | mask[-1].any() | mask[:, 0].any() | mask[:, -1].any()
+        yield total, not bool(cut), torch.linalg.inv(pose.double()), camera.double()
 
 
 @torch.no_grad()
@@ -167,8 +171,9 @@ def visual_hull(
 ) -> Tensor:
     """Cells that no view proves empty: space carving from silhouettes (Laurentini 1994).
 
-    A cell is carved when its whole projection, plus a margin, falls on pixels with alpha 0 in some view. What a view
-    does not see (outside the picture, behind the camera) it does not carve.
+    A cell is carved when its whole projection, plus a margin, falls on pixels with alpha 0 in some view. A silhouette
+    that does not touch the edge of its picture is taken for the whole object, so that what lies beyond the edge is
+    empty, too; if it does touch the edge, the view carves only what it sees. What is behind a camera it never carves.
 
     Args:
         grid: box and resolution.
@@ -184,7 +189,7 @@ def visual_hull(
     resolution = torch.tensor(grid.resolution, device=grid.bounds.device)
     radius = float(((grid.bounds[1] - grid.bounds[0]) / resolution).norm()) / 2
     kept = torch.arange(grid.cells.numel(), device=alpha.device)
-    for total, world_to_camera, (fx, fy, cx, cy) in _alpha_views(alpha, poses, intrinsics):
+    for total, whole, world_to_camera, (fx, fy, cx, cy) in _alpha_views(alpha, poses, intrinsics):
         survivors = []
         for part in torch.split(kept, chunk):
             local = grid.centres(part).double() @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
@@ -195,15 +200,11 @@ def visual_hull(
                 radius * torch.maximum(fx, fy) * (1 + (local[:, :2] / safe[:, None]).norm(dim=-1)) / safe
                 + margin
             )
-            seen_whole = (
-                (depth > radius)
-                & (column - pixels >= 0)
-                & (column + pixels <= width)
-                & (row - pixels >= 0)
-                & (row + pixels <= height)
-            )
+            inside = (column - pixels >= 0) & (column + pixels <= width)
+            inside &= (row - pixels >= 0) & (row + pixels <= height)
+            judged = (depth > radius) & (inside | whole)
             pixels = pixels.clamp(max=float(max(height, width)))
-            empty = seen_whole & (_footprint(total, row.nan_to_num(0), column.nan_to_num(0), pixels) == 0)
+            empty = judged & (_footprint(total, row.nan_to_num(0), column.nan_to_num(0), pixels) == 0)
             survivors.append(part[~empty])
         kept = torch.cat(survivors)
     hull = torch.zeros(grid.cells.numel(), dtype=torch.uint8, device=alpha.device)

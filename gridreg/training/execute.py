@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from gridreg.errors import InputError
 from gridreg.scenes import Scene
 from gridreg.training.checkpoint import has_checkpoint
@@ -51,7 +53,14 @@ class Execution:
         return self.out / "checkpoint"
 
     def save(self) -> None:
-        """Write the checkpoint."""
+        """Write the checkpoint.
+
+        Raises:
+            InputError: if a parameter is not finite; the last good checkpoint stays.
+        """
+        for name, value in self.trainer.field.named_parameters():
+            if not bool(torch.isfinite(value).all()):
+                raise InputError(f"step {self.trainer.step}: {name} is not finite; expected numbers")
         record = {"history": self.history.state_dict(), "seconds": self.seconds}
         save_run(self.checkpoint, self.trainer, self.config, record)
 
@@ -79,10 +88,10 @@ class Execution:
 
         try:
             trainer.train(each=each)
+            self.save()
         except InputError as error:
             kept = f"the last good checkpoint is {self.checkpoint}" if has_checkpoint(self.checkpoint) else ""
             raise InputError(f"{error}; {kept or 'no checkpoint was written before'}") from error
-        self.save()
         return trainer.step >= settings.steps
 
     def _note_masks(self) -> None:
