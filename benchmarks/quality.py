@@ -1,0 +1,123 @@
+"""Score presets and compositions on real scenes, one JSON file a run.
+
+    python benchmarks/quality.py --data DIR --scenes lego chair --runs quick quick:tensorf quick:few_tensorf --seeds 0
+
+A run is PRESET or PRESET:COMPOSITION. Results that are stored already are not computed again. The table is printed
+from the stored files: `python benchmarks/quality.py --table`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+from pathlib import Path
+
+import torch
+
+from gridreg.errors import InputError
+from gridreg.training import configure, execute, open_scene
+from gridreg.training.files import write_json
+from gridreg.training.options import TrainOptions
+
+RESULTS = Path(__file__).parent / "results" / "quality"
+
+
+def result_path(scene: str, run: str, seed: int, steps: int | None, protocol: str) -> Path:
+    length = "" if steps is None else f"-{steps}steps"
+    return RESULTS / f"{scene}-{protocol}-{run.replace(':', '+')}{length}-seed{seed}.json"
+
+
+def score(folder: Path, run: str, seed: int, steps: int | None, protocol: str, backend: str) -> None:
+    target = result_path(folder.name, run if backend == "auto" else f"{run}-{backend}", seed, steps, protocol)
+    if target.exists():
+        return
+    preset, _, composition = run.partition(":")
+    options = TrainOptions(
+        scene=folder,
+        protocol=protocol,
+        preset=preset,
+        composition=composition or None,
+        seed=seed,
+        steps=steps,
+    )
+    config = configure(options)
+    scene = open_scene(config, cache=Path(tempfile.gettempdir()))
+    with tempfile.TemporaryDirectory() as out:
+        _, metrics = execute(config, scene, out)
+    if metrics is None:
+        raise KeyboardInterrupt
+    metrics["config"] = {**metrics["config"], "scene": folder.name}
+    metrics["run"] = run
+    metrics["command"] = [
+        "benchmarks/quality.py",
+        "--scenes",
+        folder.name,
+        "--runs",
+        run,
+        "--seeds",
+        str(seed),
+    ]
+    write_json(target, metrics)
+    print(row(metrics), flush=True)
+
+
+def row(metrics: dict) -> str:
+    mean, seconds = metrics["mean"], metrics["seconds"]
+    return (
+        f"| {metrics['scene']} | {metrics['protocol']} | {metrics['run']} | {metrics['seed']} | {metrics['steps']} "
+        f"| {mean['psnr']:.2f} | {mean['ssim_gaussian']:.4f} | {mean['ssim_uniform']:.4f} | {seconds['train']:.0f} "
+        f"| {metrics['versions']['threads']} |"
+    )
+
+
+def table() -> None:
+    print(
+        "| scene | protocol | run | seed | steps | PSNR (dB) | SSIM 11x11 | SSIM 7x7 | training (s) | threads |"
+    )
+    print("|---|---|---|---|---|---|---|---|---|---|")
+    for path in sorted(RESULTS.glob("*.json")):
+        print(row(json.loads(path.read_text())))
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--data", type=Path, help="folder that holds the scenes")
+    parser.add_argument("--scenes", nargs="+", default=[])
+    parser.add_argument("--runs", nargs="+", default=["quick"])
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
+    parser.add_argument("--steps", type=int)
+    parser.add_argument("--protocol", default="dietnerf8")
+    parser.add_argument("--threads", type=int)
+    parser.add_argument("--backend", choices=("auto", "torch"), default="auto")
+    parser.add_argument("--table", action="store_true", help="print what is stored, and end")
+    arguments = parser.parse_args()
+    if arguments.table:
+        table()
+        return 0
+    if arguments.data is None:
+        parser.error("--data: expected the folder that holds the scenes")
+    if arguments.threads:
+        torch.set_num_threads(arguments.threads)
+    if arguments.backend != "auto":
+        from gridreg.rendering.backends import use_backend
+
+        use_backend(arguments.backend)
+    for seed in arguments.seeds:
+        for scene in arguments.scenes:
+            for run in arguments.runs:
+                score(
+                    arguments.data / scene, run, seed, arguments.steps, arguments.protocol, arguments.backend
+                )
+    return 0
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main())
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
