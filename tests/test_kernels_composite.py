@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
@@ -120,6 +121,18 @@ def test_thread_count_does_not_matter():
             assert torch.equal(a, b)
     finally:
         torch.set_num_threads(threads)
+
+
+def test_two_python_threads_at_once():
+    """As a viewer renders beside a trainer."""
+    tau, values, offsets = random_packed(7, [13, 0, 55] * 300)
+    expected = composite.accumulate(composite.composite_weights(tau, offsets), values, offsets)
+
+    def work(_):
+        return composite.accumulate(composite.composite_weights(tau, offsets), values, offsets)
+
+    with ThreadPoolExecutor(2) as pool:
+        assert all(torch.equal(found, expected) for found in pool.map(work, range(60)))
 
 
 def test_register(monkeypatch: pytest.MonkeyPatch):
