@@ -7,7 +7,6 @@ import socket
 import sys
 import threading
 import time
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -22,6 +21,7 @@ from gridreg.export.pictures import z_depth
 from gridreg.export.viewer import Viewer
 from gridreg.rendering import Rendered, camera_rays
 from tests.export_fields import AnalyticField, ball, ball_model, ring_of_views
+from tests.export_viewing import FakeClient
 
 pytest.importorskip("viser", reason="viser (extra 'viewer') is not installed")
 
@@ -31,37 +31,6 @@ def taken_port() -> tuple[socket.socket, int]:
     listener.bind(("127.0.0.1", 0))
     listener.listen()
     return listener, listener.getsockname()[1]
-
-
-class FakeClient:
-    """What the viewer asks of a browser, without one."""
-
-    def __init__(self, pose: torch.Tensor, size: tuple[int, int] = (60, 80)) -> None:
-        self.client_id = 7
-        self.pictures: list[np.ndarray] = []
-        self.files: list[tuple[str, bytes]] = []
-        self.moved: Any = None
-        self.camera = SimpleNamespace(
-            image_height=size[0], image_width=size[1], fov=math.radians(50), on_update=self._listen
-        )
-        self.scene = SimpleNamespace(set_background_image=self._show)
-        self.place(pose)
-
-    def _listen(self, callback: Any) -> Any:
-        self.moved = callback
-        return callback
-
-    def _show(self, pixels: np.ndarray, **_: Any) -> None:
-        self.pictures.append(pixels)
-
-    def send_file_download(self, name: str, content: bytes, **_: Any) -> None:
-        self.files.append((name, content))
-
-    def place(self, pose: torch.Tensor) -> None:
-        from scipy.spatial.transform import Rotation
-
-        x, y, z, w = Rotation.from_matrix(pose[:3, :3].double().numpy() @ np.diag([1, -1, -1])).as_quat()
-        self.camera.wxyz, self.camera.position = np.array([w, x, y, z]), pose[:3, 3].numpy()
 
 
 FRONT = look_at(np.array([3.0, 0, 0]), np.zeros(3), np.array([0.0, 0, 1]))
