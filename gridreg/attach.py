@@ -9,26 +9,18 @@ and pickles of the module carry it along.
 
 from __future__ import annotations
 
-import types
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any, cast
-from weakref import WeakValueDictionary
+from collections.abc import Iterator
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from gridreg.base import Context, Regularizer
 from gridreg.errors import InputError
+from gridreg.instance_class import STACKS, set_instance_class
 from gridreg.sites import Match
 
 __all__ = ["Slot", "attach", "detach", "open_channels", "strip"]
-
-_STACKS = "_gridreg_stacks"
-_BASE = "_gridreg_base"
-
-_CLASSES: WeakValueDictionary[tuple[type[nn.Module], tuple[str, ...]], type[nn.Module]] = (
-    WeakValueDictionary()
-)
 
 
 class Slot:
@@ -150,15 +142,15 @@ def attach(match: Match, slot: Slot) -> None:
     elif match.place.kind == "inputs":
         match.module.register_forward_pre_hook(InputHook(slot, match.place.selector.item), with_kwargs=True)
     else:
-        stacks = match.module.__dict__.setdefault(_STACKS, {})
+        stacks = match.module.__dict__.setdefault(STACKS, {})
         stacks.setdefault(match.attribute, []).append(slot)
-        _set_class(match.module, tuple(sorted(stacks)))
+    _update_class(match.module)
 
 
 def detach(module: nn.Module, owner: str | None) -> None:
     """Take the slots of one owner (None: of all) off a module; with the last one its class is the original
     again."""
-    stacks: dict[str, list[Slot]] | None = module.__dict__.get(_STACKS)
+    stacks: dict[str, list[Slot]] | None = module.__dict__.get(STACKS)
     if stacks is not None:
         for attribute, slots in list(stacks.items()):
             # A new list, so that a compiled graph or a copy that holds the old one does not change
@@ -167,8 +159,7 @@ def detach(module: nn.Module, owner: str | None) -> None:
             if not stacks[attribute]:
                 del stacks[attribute]
         if not stacks:
-            del module.__dict__[_STACKS]
-        _set_class(module, tuple(sorted(stacks)))
+            del module.__dict__[STACKS]
     for hooks, extra in (
         (module._forward_hooks, module._forward_hooks_with_kwargs),
         (module._forward_pre_hooks, module._forward_pre_hooks_with_kwargs),
@@ -177,6 +168,13 @@ def detach(module: nn.Module, owner: str | None) -> None:
             if isinstance(hook, (OutputHook, InputHook)) and owner in (None, hook.slot.owner):
                 del hooks[key]
                 extra.pop(key, None)
+    _update_class(module)
+
+
+def _update_class(module: nn.Module) -> None:
+    """Give a module the class for what is attached to it now."""
+    attached = next(slots_of(module), None) is not None
+    set_instance_class(module, tuple(sorted(module.__dict__.get(STACKS, ()))) if attached else None)
 
 
 def strip(module: nn.Module) -> None:
@@ -187,7 +185,7 @@ def strip(module: nn.Module) -> None:
 
 def slots_of(module: nn.Module) -> Iterator[Slot]:
     """All slots on one module, for inspection."""
-    for slots in module.__dict__.get(_STACKS, {}).values():
+    for slots in module.__dict__.get(STACKS, {}).values():
         yield from slots
     for hook in (*module._forward_hooks.values(), *module._forward_pre_hooks.values()):
         if isinstance(hook, (OutputHook, InputHook)):
@@ -210,74 +208,8 @@ def open_channels(module: nn.Module, name: str) -> int | None:
     if "." in name:
         path, _, name = name.rpartition(".")
         module = module.get_submodule(path)
-    stacks = module.__dict__.get(_STACKS)
+    stacks = module.__dict__.get(STACKS)
     if stacks is None:
         return None
     closed = [slot.open for slot in stacks.get(name, ()) if slot.active and slot.open is not None]
     return min(closed) if closed else None
-
-
-def _set_class(module: nn.Module, names: tuple[str, ...]) -> None:
-    """Give a module the class with properties for `names`, or its original class for none."""
-    cls = type(module)
-    base: type[nn.Module] = cls.__dict__.get(_BASE, cls)
-    module.__class__ = _attached_class(base, names) if names else base
-
-
-def _attached_class(base: type[nn.Module], names: tuple[str, ...]) -> type[nn.Module]:
-    """The subclass of `base` with a property for each name, the same object for the same arguments."""
-    cls = _CLASSES.get((base, names))
-    if cls is None:
-        members: dict[str, Any] = {name: _property(name) for name in names}
-        members |= {
-            _BASE: base,
-            "__reduce_ex__": _reduce_ex,
-            "__module__": base.__module__,
-            "__qualname__": base.__qualname__,
-            "__doc__": base.__doc__,
-        }
-        cls = types.new_class(
-            base.__name__, (base,), {"metaclass": type(base)}, lambda body: body.update(members)
-        )
-        _CLASSES[base, names] = cls
-    return cls
-
-
-def _property(name: str) -> property:
-    """Property that transforms the raw tensor of this name."""
-
-    def get(self: nn.Module) -> Any:
-        own = self.__dict__
-        value = own["_parameters"].get(name)
-        if value is None:
-            value = own["_buffers"].get(name)
-        if value is None:
-            # The name was deleted or holds None, which is how torch itself finds it then.
-            return nn.Module.__getattr__(self, name)
-        for slot in own.get(_STACKS, {}).get(name, ()):
-            value = slot(value, self.training)
-        return value
-
-    return property(get)
-
-
-def _reduce_ex(self: nn.Module, protocol: Any) -> Any:
-    """Pickle and copy by the original class and the names: the subclass itself cannot be imported."""
-    cls = type(self)
-    base, names = getattr(cls, _BASE), tuple(self.__dict__.get(_STACKS, ()))
-    function, arguments, *rest = cast(tuple[Any, ...], super(cls, self).__reduce_ex__(protocol))
-    arguments = tuple(base if argument is cls else argument for argument in arguments)
-    return (_rebuild, (base, tuple(sorted(names)), function, arguments), *rest)
-
-
-def _rebuild(
-    base: type[nn.Module],
-    names: Sequence[str],
-    function: Callable[..., nn.Module],
-    arguments: tuple[Any, ...],
-) -> nn.Module:
-    """The empty module, with its properties; its state follows."""
-    module = function(*arguments)
-    if names:
-        module.__class__ = _attached_class(base, tuple(names))
-    return module

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import fnmatch
 import inspect
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Literal, TypeAlias
@@ -15,6 +16,9 @@ from gridreg.errors import InputError
 from gridreg.sites import Match, Place, Selector, Site, SiteLike
 
 __all__ = ["find", "register_adapter", "sites_of"]
+
+# DistributedDataParallel and DataParallel, and torch.compile.
+_WRAPPERS = re.compile(r"^((module|_orig_mod)\.)+")
 
 Adapter: TypeAlias = Callable[[nn.Module], Mapping[str, "Site | Selector"]]
 
@@ -108,7 +112,10 @@ def _unknown(name: str, names: Sequence[str], reason: str) -> str:
 
 
 def _matching(pattern: str, names: Iterable[str]) -> list[str]:
-    """Names that match a glob whose wildcards stay within a dotted part, or, where none does, cross dots."""
+    """Names that match a glob whose wildcards stay within a dotted part, or, where none does, cross dots.
+
+    Where nothing matches either, the prefixes that torch's wrappers put in front of all names do not count.
+    """
     names = list(names)
     parts = pattern.split(".")
     within = [
@@ -117,7 +124,11 @@ def _matching(pattern: str, names: Iterable[str]) -> list[str]:
         if name.count(".") == len(parts) - 1
         and all(fnmatch.fnmatchcase(n, p) for n, p in zip(name.split("."), parts, strict=True))
     ]
-    return within or [name for name in names if fnmatch.fnmatchcase(name, pattern)]
+    found = within or [name for name in names if fnmatch.fnmatchcase(name, pattern)]
+    bare = {_WRAPPERS.sub("", name): name for name in names}
+    if found or list(bare) == names:
+        return found
+    return [bare[name] for name in _matching(pattern, bare)]
 
 
 def _find_selector(field: nn.Module, selector: Selector) -> list[Match]:

@@ -15,7 +15,7 @@ from gridreg.attach import slots_of
 from gridreg.finding import find
 from gridreg.sites import raw_tensor
 from tests.fields import DESIGNS, made, points
-from tests.laws import anatomy, same
+from tests.observations import anatomy, same
 
 GROWING = [name for name, design in DESIGNS.items() if design.grow is not None]
 

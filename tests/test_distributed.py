@@ -69,7 +69,7 @@ def test_two_processes_have_the_gradients_of_one(tmp_path: Path) -> None:
     for worker in workers:
         worker.start()
     try:
-        found_names, found = queue.get(timeout=120)
+        found_names, found = queue.get(timeout=300)
     finally:
         for worker in workers:
             worker.join(60)
