@@ -90,6 +90,8 @@ def camera_to_world(image: ColmapImage, where: str) -> NDArray[np.float64]:
     length = np.linalg.norm(quaternion)
     if not np.isfinite(length) or length < 1e-9:
         raise InputError(f"{where}: rotation {image.quaternion} is no quaternion")
+    if not np.isfinite(image.translation).all():
+        raise InputError(f"{where}: translation {image.translation} is not finite")
     w, x, y, z = quaternion / length
     rotation = np.array(
         [

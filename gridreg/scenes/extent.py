@@ -83,7 +83,7 @@ def blender_extent(
 def points_extent(poses: NDArray[np.float64], points: NDArray[np.float64]) -> Extent:
     """Derive the box from points known to lie on surfaces, such as those of structure from motion.
 
-    The box holds the middle 99 % of them along each axis and, on every side, 15 % of its longest edge more;
+    The box holds the middle 99 % of them along each axis and, on every side, 20 % of its longest edge more;
     near and far are the least and greatest distances at which cameras see points of the box, with a tenth of
     slack.
 
@@ -96,7 +96,8 @@ def points_extent(poses: NDArray[np.float64], points: NDArray[np.float64]) -> Ex
     """
     low, high = np.quantile(points, [0.005, 0.995], axis=0)
     # The same on every side: thin and plain parts that points miss may stick out of any of them.
-    margin = 0.15 * float((high - low).max()) + 1e-6
+    apart = np.linalg.norm(poses[:, :3, 3] - points.mean(axis=0), axis=-1)
+    margin = max(0.2 * float((high - low).max()), 0.01 * float(apart.max()))
     bounds = np.stack([low - margin, high + margin])
     inside = points[((points >= bounds[0]) & (points <= bounds[1])).all(axis=1)]
     offset = inside[None] - poses[:, None, :3, 3]

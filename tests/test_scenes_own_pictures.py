@@ -1,0 +1,156 @@
+"""`prepare` on pictures without cameras, with a stand-in for pycolmap."""
+
+from __future__ import annotations
+
+import importlib.util
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from gridreg.errors import InputError
+from gridreg.scenes import builtin_scene, load_scene, prepare
+from gridreg.scenes import structure_from_motion as worker
+
+SIZE = 16
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return builtin_scene(tmp_path_factory.mktemp("scenes"), size=SIZE)
+
+
+def refused(source: Path, out: Path, pattern: str, **options: Any) -> None:
+    with pytest.raises(InputError, match=pattern) as error:
+        prepare(source, out, **options)
+    assert "\n" not in str(error.value)
+    assert not out.exists() or out.is_file()
+    # Nothing half-written stays beside it either.
+    assert not [path for path in out.parent.glob(".*") if out.name in path.name]
+
+
+@pytest.fixture
+def pictures(source: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(source / "train", tmp_path / "pictures"))
+
+
+class TestPictures:
+    """Pictures without cameras, with a stand-in for pycolmap that knows them."""
+
+    @pytest.fixture
+    def stand_in(self, source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+        """A worker that registers the pictures named in ``names.txt``, from a text model of the true cameras."""
+        views = load_scene(source, "first18", test=[]).train
+        lines = []
+        for name, pose in zip(views.names, views.poses.numpy(), strict=True):
+            inverse = np.linalg.inv(pose @ np.diag([1.0, -1, -1, 1]))
+            w = np.sqrt(max(0, 1 + np.trace(inverse[:3, :3]))) / 2
+            m = inverse[:3, :3]
+            x, y, z = np.array([m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]]) / (4 * w)
+            lines.append((f"{name}.png", " ".join(map(str, [w, x, y, z, *inverse[:3, 3]]))))
+        focal = float(views.intrinsics[0, 0])
+        script = tmp_path / "stand_in.py"
+        script.write_text(
+            "import sys, pathlib\n"
+            "pictures, out = map(pathlib.Path, sys.argv[1:])\n"
+            f"known = dict({lines!r})\n"
+            f"asked = pathlib.Path({str(tmp_path / 'names.txt')!r})\n"
+            "names = asked.read_text().split() if asked.exists() else sorted(p.name for p in pictures.iterdir())\n"
+            "(out / 'model').mkdir()\n"
+            f"(out / 'model/cameras.txt').write_text('1 SIMPLE_PINHOLE 16 16 {focal} 8 8')\n"
+            "text = '\\n'.join(f'{k} {known[n]} 1 {n}\\n' for k, n in enumerate(names))\n"
+            "(out / 'model/images.txt').write_text(text + '\\n')\n"
+            "(out / 'model/points3D.txt').write_text('')\n"
+            "print('noise'); print('features'); print('matches'); print('cameras'); print('registered', len(names))\n"
+        )
+        monkeypatch.setattr(worker, "__file__", str(script))
+        monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
+        return script
+
+    def test_become_a_scene(self, pictures: Path, stand_in: Path, tmp_path: Path, source: Path) -> None:
+        stages: list[str] = []
+        prepared = prepare(pictures, tmp_path / "out", progress=stages.append)
+        assert stages == ["features", "matches", "cameras", "box"]
+        assert len(prepared.registered) == 18
+        loaded = load_scene(tmp_path / "out", "holdout8")
+        original = load_scene(source, "first18", test=[]).train
+        rows = [original.names.index(name) for name in loaded.train.names]
+        assert torch.equal(loaded.train.rgba, original.rgba[rows])
+        relative = torch.linalg.inv(loaded.train.poses[0]) @ loaded.train.poses[5]
+        wanted = torch.linalg.inv(original.poses[rows[0]]) @ original.poses[rows[5]]
+        torch.testing.assert_close(relative[:3, :3], wanted[:3, :3], atol=1e-4, rtol=0)
+
+    def test_some_are_left_out_and_named(self, pictures: Path, stand_in: Path, tmp_path: Path) -> None:
+        (tmp_path / "names.txt").write_text(" ".join(f"r_{k}.png" for k in range(10)))
+        prepared = prepare(pictures, tmp_path / "out")
+        assert len(prepared.registered) == 10
+        assert prepared.missing == tuple(sorted(f"r_{k}.png" for k in range(10, 18)))
+        assert "10 of 18 pictures have cameras (not r_10.png," in str(prepared)
+
+    def test_too_few_registered(self, pictures: Path, stand_in: Path, tmp_path: Path) -> None:
+        (tmp_path / "names.txt").write_text(" ".join(f"r_{k}.png" for k in range(8)))
+        refused(pictures, tmp_path / "out", r"only 8 of 18 pictures could be registered; take more pictures")
+
+    def test_the_worker_fails(self, pictures: Path, stand_in: Path, tmp_path: Path) -> None:
+        stand_in.write_text("import sys; sys.stderr.write('a\\nno memory\\n'); sys.exit(3)")
+        refused(pictures, tmp_path / "out", r"pycolmap failed with status 3: no memory")
+        stand_in.write_text("import os; os.abort()")
+        refused(pictures, tmp_path / "out", r"pycolmap failed with status -6: no message")
+
+    def test_transparent_pictures_are_matched_on_grey(
+        self, pictures: Path, stand_in: Path, tmp_path: Path
+    ) -> None:
+        seen = tmp_path / "seen"
+        code = f"import shutil\nshutil.copytree(sys.argv[1], {str(seen)!r})\n"
+        stand_in.write_text(stand_in.read_text().replace("pictures, out =", code + "pictures, out ="))
+        prepare(pictures, tmp_path / "out")
+        image = np.asarray(Image.open(seen / "r_0.png"))
+        assert image.shape == (SIZE, SIZE, 3)
+        assert image[0, 0].tolist() == [128, 128, 128]
+
+    def test_turned_pictures_are_copied_upright(self, pictures: Path, stand_in: Path, tmp_path: Path) -> None:
+        path = pictures / "r_4.png"
+        upright = np.asarray(Image.open(path))
+        exif = Image.Exif()
+        exif[274] = 8
+        Image.fromarray(np.ascontiguousarray(np.rot90(upright, -1))).save(path, exif=exif)
+        prepare(pictures, tmp_path / "out")
+        copied = Image.open(tmp_path / "out/images/r_4.png")
+        assert copied.getexif().get(274) is None
+        np.testing.assert_array_equal(np.asarray(copied), upright)
+        assert (tmp_path / "out/images/r_5.png").read_bytes() == (pictures / "r_5.png").read_bytes()
+
+    def test_none(self, tmp_path: Path) -> None:
+        (tmp_path / "empty").mkdir()
+        refused(tmp_path / "empty", tmp_path / "out", r"empty: found nothing, expected pictures")
+        (tmp_path / "empty/a.HEIC").write_text("")
+        (tmp_path / "empty/notes.txt").write_text("")
+        refused(
+            tmp_path / "empty", tmp_path / "out", r"found only \.HEIC, \.txt files, expected pictures \(\.jpg"
+        )
+
+    def test_three(self, pictures: Path, tmp_path: Path) -> None:
+        for k in range(3, 18):
+            (pictures / f"r_{k}.png").unlink()
+        refused(pictures, tmp_path / "out", "found 3 pictures, expected at least 4; take more pictures")
+
+    def test_of_different_sizes(self, pictures: Path, tmp_path: Path) -> None:
+        Image.new("RGB", (12, 16)).save(pictures / "r_7.png")
+        refused(pictures, tmp_path / "out", r"r_7\.png: picture is 12x16 upright, expected 16x16 as r_0\.png")
+
+    def test_damaged(self, pictures: Path, tmp_path: Path) -> None:
+        path = pictures / "r_7.png"
+        path.write_bytes(path.read_bytes()[:-40])
+        refused(pictures, tmp_path / "out", r"r_7\.png: not a whole image")
+
+    def test_unreadable_exif(self, pictures: Path, tmp_path: Path) -> None:
+        Image.new("RGB", (SIZE, SIZE)).save(pictures / "a.jpg", exif=b"Exif\0\0garbage that is no TIFF")
+        refused(pictures, tmp_path / "out", r"a\.jpg: EXIF data cannot be read")
+
+    def test_without_pycolmap(self, pictures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+        refused(pictures, tmp_path / "out", r"pycolmap is not installed: pip install 'gridreg\[colmap\]'")
