@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Callable
+from dataclasses import replace
 
 from gridreg.base import Regularizer
 from gridreg.errors import InputError
@@ -55,6 +56,11 @@ def composition(name: str) -> list[Regularizer]:
     return _COMPOSITIONS[name]()
 
 
+def _none() -> list[Regularizer]:
+    """No regularizer at all: the field alone."""
+    return []
+
+
 def _tensorf() -> list[Regularizer]:
     """TensoRF (Chen et al., ECCV 2022): L1 of the density grids, halved at the first occupancy mask."""
     return [L1("density", weight=Piecewise(values=(8e-5, 4e-5), steps=(2000,)))]
@@ -67,6 +73,11 @@ def _few_tensorf() -> list[Regularizer]:
         OcclusionLoss(weight=0.01, samples=20),
         *_penalties(),
     ]
+
+
+def _few_tensorf_printed() -> list[Regularizer]:
+    """Few TensoRF with the masks as the equation in the papers has them, which close channels again."""
+    return [replace(r, variant="printed") if isinstance(r, FrequencyMask) else r for r in _few_tensorf()]
 
 
 def _few_tensorf_authors() -> list[Regularizer]:
@@ -111,11 +122,13 @@ def _sanerf() -> list[Regularizer]:
     ]
 
 
+register_composition("none", _none)
 register_composition("tensorf", _tensorf)
 register_composition("few_tensorf", _few_tensorf)
 # The fine-tuned row of the paper differs in the length of the run and its resampling, not in the
 # regularizers.
 register_composition("few_tensorf_finetuned", _few_tensorf)
+register_composition("few_tensorf_printed", _few_tensorf_printed)
 register_composition("few_tensorf_authors", _few_tensorf_authors)
 register_composition("freenerf", _freenerf)
 register_composition("fourierf", _fourierf)

@@ -202,7 +202,7 @@ def test_named_compositions_are_fresh_plain_and_complete(name: str) -> None:
     first, second = gridreg.composition(name), gridreg.composition(name)
     assert first == second
     assert first is not second
-    assert len(first) > 0
+    assert (len(first) == 0) == (name == "none")
     assert gridreg.from_config(gridreg.to_config(first)) == first
 
 
@@ -225,6 +225,13 @@ def test_few_tensorf_has_the_settings_of_its_paper() -> None:
     assert {"density.planes", "density.lines"} <= {mask.site for mask in masks}
     assert {mask.variant for mask in masks} == {"authors"}
     assert not any(isinstance(r, gridreg.OcclusionLoss) for r in authors)
+
+
+def test_the_printed_variant_differs_in_its_masks_alone() -> None:
+    few, printed = gridreg.composition("few_tensorf"), gridreg.composition("few_tensorf_printed")
+    changed = [(a, b) for a, b in zip(few, printed, strict=True) if a != b]
+    assert [type(a) for a, _ in changed] == [gridreg.FrequencyMask] * 5
+    assert all(b == replace(a, variant="printed") for a, b in changed)
 
 
 def test_rivals_are_there() -> None:
