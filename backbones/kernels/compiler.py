@@ -13,20 +13,28 @@ its arguments by their position and then serves tasks until there are none::
                 break
             ...
 
-Kernels are compiled on their first use and cached on disk. Functions that they call are marked with `inline`.
+Kernels are compiled on their first use and cached on disk. Functions that they call are marked with `inline`. What
+reads the table is generated, not compiled: each function that numba has to compile costs the first run some hundredths
+of a second, and a slice or a new array in a kernel costs several.
 """
 
 from __future__ import annotations
 
+import functools
+import hashlib
 import threading
 import warnings
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
-from numba import carray, cfunc, extending, njit, types  # type: ignore[attr-defined]
+from numba import cfunc, extending, njit, types
+from numba.core import cgutils
+from numba.core.caching import FunctionCache
 from numba.core.errors import NumbaWarning
+from numba.np import arrayobj
 
 __all__ = [
     "Kernel",
@@ -42,6 +50,7 @@ __all__ = [
     "matrix",
     "next_task",
     "real",
+    "scratch",
     "size",
     "uint8",
     "vector",
@@ -51,7 +60,11 @@ float32, int32, int64, uint8 = np.float32, np.int32, np.int64, np.uint8
 
 # Reordering and contraction make sums fast; not-a-number and infinity keep their meaning, as a run must see them.
 _FAST = {"contract", "nsz", "arcp", "reassoc"}
+_OPTIONS: dict[str, Any] = {"error_model": "numpy", "boundscheck": False}
+# Only kernels are called from outside.
+_HELPER: dict[str, Any] = {**_OPTIONS, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 _TABLE = types.CPointer(types.int64)  # type: ignore[no-untyped-call]
+_WORD = ir.IntType(64)
 _COMPILING = threading.Lock()
 
 # Untyped: a call from a kernel has fewer arguments than the function that generates it.
@@ -80,95 +93,161 @@ class Kernel:
         return int(self._compiled.address)
 
     def _compile(self) -> Any:
-        signature = types.void(_TABLE)
-        options: dict[str, Any] = {"nopython": True, "fastmath": _FAST, "error_model": "numpy"}
+        compiled: Any = functools.partial(cfunc, types.void(_TABLE), fastmath=_FAST, **_OPTIONS)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NumbaWarning)
             try:
-                return cfunc(signature, cache=True, **options)(self.function)
+                cache = FunctionCache(self.function)  # type: ignore[no-untyped-call]
+                _forget_outdated(cache.cache_path)
+                return compiled(cache=True)(self.function)
             except (RuntimeError, OSError):
                 # No folder to keep a cache in: neither beside the source nor in the user's.
-                return cfunc(signature, cache=False, **options)(self.function)
+                return compiled(cache=False)(self.function)
 
 
 kernel = Kernel
 
 
+@functools.cache
+def _sources() -> tuple[tuple[str, ...], str]:
+    """Names of the modules of this package and the digest of what they say."""
+    files = sorted(Path(__file__).parent.glob("*.py"))
+    digest = hashlib.sha256()
+    for file in files:
+        digest.update(file.read_bytes())
+    return tuple(file.stem for file in files), digest.hexdigest()
+
+
+@functools.cache
+def _forget_outdated(folder: str) -> None:
+    """Drop cached kernels of other versions of this package.
+
+    numba drops a kernel when the kernel's own file changes, not when a function that it calls does in another file.
+    """
+    names, digest = _sources()
+    stamp = Path(folder) / "gridreg-kernels.sha256"
+    if stamp.exists() and stamp.read_text() == digest:
+        return
+    Path(folder).mkdir(parents=True, exist_ok=True)
+    for name in names:
+        for index in Path(folder).glob(f"{name}.*.nbi"):
+            index.unlink(missing_ok=True)
+    stamp.write_text(digest)
+
+
 def inline(function: Callable[..., Any]) -> Any:
     """Mark a function that kernels call: compiled with them, fast arithmetic, no checks of bounds."""
-    return njit(nogil=True, fastmath=_FAST, error_model="numpy", boundscheck=False)(function)
+    return njit(fastmath=_FAST, **_HELPER)(function)
 
 
 def exact(function: Callable[..., Any]) -> Any:
     """Like `inline`, with every operation rounded on its own, in the order written."""
-    return njit(nogil=True, fastmath=False, error_model="numpy", boundscheck=False)(function)
+    return njit(fastmath=False, **_HELPER)(function)
+
+
+def _word(builder: Any, table: Any, place: Any, offset: int) -> Any:
+    """Word ``offset`` of argument ``place``."""
+    at = builder.add(builder.mul(place, _WORD(4)), _WORD(2 + offset))
+    return builder.load(builder.gep(table, [at]))
+
+
+def _place(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    return context.cast(builder, arguments[1], signature.args[1], types.int64)
 
 
 @intrinsic
-def _fetch_add(context: Any, pointer: Any, value: Any) -> Any:
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.atomic_rmw("add", arguments[0], arguments[1], "monotonic")
+def next_task(context: Any, table: Any) -> Any:
+    """``next_task(table)``: number of a task that no other thread has, or -1 when all are taken."""
 
-    return types.int64(_TABLE, types.int64), generate
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        task = builder.atomic_rmw("add", arguments[0], _WORD(1), "monotonic")
+        tasks = builder.load(builder.gep(arguments[0], [_WORD(1)]))
+        return builder.select(builder.icmp_signed("<", task, tasks), task, _WORD(-1))
+
+    return types.int64(_TABLE), generate
 
 
 @intrinsic
-def _pointer(context: Any, address: Any) -> Any:
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.inttoptr(arguments[0], ir.IntType(8).as_pointer())
+def size(context: Any, table: Any, place: Any, axis: Any) -> Any:
+    """``size(table, place, axis)``: length of a tensor along an axis; 1 for an axis that it does not have."""
 
-    return types.voidptr(types.int64), generate
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        axis = context.cast(builder, arguments[2], signature.args[2], types.int64)
+        at = builder.mul(_place(context, builder, signature, arguments), _WORD(4))
+        return builder.load(builder.gep(arguments[0], [builder.add(builder.add(at, axis), _WORD(3))]))
+
+    return types.int64(_TABLE, place, axis), generate
 
 
 @intrinsic
-def _as_double(context: Any, bits: Any) -> Any:
+def integer(context: Any, table: Any, place: Any) -> Any:
+    """``integer(table, place)``: an integer."""
+
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.bitcast(arguments[0], ir.DoubleType())
+        return _word(builder, arguments[0], _place(context, builder, signature, arguments), 0)
 
-    return types.float64(types.int64), generate
-
-
-@inline
-def next_task(table: Any) -> Any:
-    """Number of a task that no other thread has, or -1 when all are taken."""
-    task = _fetch_add(table, 1)
-    return task if task < table[1] else -1
+    return types.int64(_TABLE, place), generate
 
 
-@inline
-def vector(table: Any, place: Any, dtype: Any) -> Any:
-    """Argument ``place``, a tensor, as ``(N,)``: all of its elements."""
-    base = 2 + 4 * place
-    return carray(_pointer(table[base]), (table[base + 1] * table[base + 2] * table[base + 3],), dtype)
+@intrinsic
+def real(context: Any, table: Any, place: Any) -> Any:
+    """``real(table, place)``: a number, as float32."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        bits = _word(builder, arguments[0], _place(context, builder, signature, arguments), 0)
+        return builder.fptrunc(builder.bitcast(bits, ir.DoubleType()), ir.FloatType())
+
+    return types.float32(_TABLE, place), generate
 
 
-@inline
-def matrix(table: Any, place: Any, dtype: Any) -> Any:
-    """Argument ``place``, a tensor of two axes."""
-    base = 2 + 4 * place
-    return carray(_pointer(table[base]), (table[base + 1], table[base + 2]), dtype)
+def _wrap(context: Any, builder: Any, kind: Any, data: Any, shape: list[Any]) -> Any:
+    """An array of type ``kind`` around memory."""
+    array = arrayobj.make_array(kind)(context, builder)  # type: ignore[no-untyped-call]
+    itemsize = context.get_constant(types.intp, context.get_abi_sizeof(context.get_data_type(kind.dtype)))
+    strides = [itemsize]
+    for length in reversed(shape[1:]):
+        strides.insert(0, builder.mul(length, strides[0]))
+    data = builder.bitcast(data, array.data.type)
+    arrayobj.populate_array(  # type: ignore[no-untyped-call]
+        array, data=data, shape=shape, strides=strides, itemsize=itemsize, meminfo=None
+    )
+    return array._getvalue()
 
 
-@inline
-def cube(table: Any, place: Any, dtype: Any) -> Any:
-    """Argument ``place``, a tensor of three axes."""
-    base = 2 + 4 * place
-    return carray(_pointer(table[base]), (table[base + 1], table[base + 2], table[base + 3]), dtype)
+def _tensor(axes: int, name: str, text: str) -> Any:
+    def typed(context: Any, table: Any, place: Any, dtype: Any) -> Any:
+        kind = types.Array(dtype.dtype, axes, "C")
+
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            place = _place(context, builder, signature, arguments)
+            data = builder.inttoptr(_word(builder, arguments[0], place, 0), ir.IntType(8).as_pointer())
+            lengths = [_word(builder, arguments[0], place, 1 + axis) for axis in range(3)]
+            # What a tensor has in more axes than asked for belongs to the last.
+            shape = [*lengths[: axes - 1], functools.reduce(builder.mul, lengths[axes - 1 :])]
+            return _wrap(context, builder, kind, data, shape)
+
+        return kind(_TABLE, place, dtype), generate
+
+    typed.__name__, typed.__doc__ = name, text
+    return intrinsic(typed)
 
 
-@inline
-def integer(table: Any, place: Any) -> Any:
-    """Argument ``place``, an integer."""
-    return table[2 + 4 * place]
+vector = _tensor(1, "vector", "``vector(table, place, dtype)``: a tensor as ``(N,)``, all of its elements.")
+matrix = _tensor(2, "matrix", "``matrix(table, place, dtype)``: a tensor of two axes.")
+cube = _tensor(3, "cube", "``cube(table, place, dtype)``: a tensor of three axes.")
 
 
-@inline
-def real(table: Any, place: Any) -> Any:
-    """Argument ``place``, a number, as float32."""
-    return np.float32(_as_double(table[2 + 4 * place]))
+@intrinsic(prefer_literal=True)
+def scratch(context: Any, length: Any, dtype: Any) -> Any:
+    """``scratch(length, dtype)``: memory of a constant length on the stack; only for the function that asks for it."""
+    if not isinstance(length, types.IntegerLiteral):
+        return None
+    kind = types.Array(dtype.dtype, 1, "C")
 
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        count = signature.args[0].literal_value
+        block = ir.ArrayType(context.get_data_type(kind.dtype), count)
+        memory = cgutils.alloca_once(builder, block)  # type: ignore[no-untyped-call]
+        return _wrap(context, builder, kind, memory, [context.get_constant(types.intp, count)])
 
-@inline
-def size(table: Any, place: Any, axis: Any) -> Any:
-    """Length of argument ``place``, a tensor, along ``axis``; 1 for an axis that it does not have."""
-    return table[3 + 4 * place + axis]
+    return kind(length, dtype), generate

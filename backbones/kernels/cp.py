@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -21,14 +20,16 @@ from backbones.kernels.compiler import (
     integer,
     kernel,
     next_task,
+    scratch,
     size,
     vector,
 )
 from backbones.kernels.lookup import ahead, linear, prefetch_row
-from backbones.kernels.places import BATCH, batch, find, new_places
+from backbones.kernels.places import BATCH, PLACES, batch, find
 from backbones.kernels.rows import ENTRY, TASKS, list_by_row, span
 from backbones.kernels.simd import LANES, load, one, store, total, wide
 from backbones.kernels.threading import launch
+from backbones.kernels.workspace import room
 
 __all__ = ["density", "density_backward", "features", "features_backward", "product_sum"]
 
@@ -71,8 +72,8 @@ def _forward(table: Any, summed: Any) -> Any:
     lines = vector(table, 3, float32), vector(table, 2, float32), vector(table, 1, float32)
     shape = size(table, 3, 0), size(table, 2, 0), size(table, 1, 0)
     samples, channels = size(table, 0, 0), size(table, 1, 1)
-    places = new_places()
-    nodes, shares = places
+    nodes, shares = scratch(PLACES, int32), scratch(PLACES, float32)
+    places = nodes, shares
     while True:
         task = next_task(table)
         if task < 0:
@@ -131,6 +132,7 @@ def _serve(
     axis: Any,
     to: Any,
     keep: Any,
+    base: Any,
     listing: Any,
     entries: Any,
     channels: Any,
@@ -138,7 +140,7 @@ def _serve(
     upstream: Any,
     summed: Any,
 ) -> Any:
-    """Add the gradients of a range of entries; what is not kept goes to the first elements of its array."""
+    """Add the gradients of a range of entries; what is not kept goes to the first elements after its base."""
     nodes, shares = listing
     blocks = read - read % LANES
     far = ENTRY * ahead(read)
@@ -149,7 +151,7 @@ def _serve(
         at = int64(nodes[e + others[0]]) * channels, int64(nodes[e + others[1]]) * channels
         between = shares[e + others[0]], shares[e + others[1]]
         below, share, g = int64(nodes[e + axis]) * channels, shares[e + axis], shares[e + 3]
-        i, j = below & keep[0], (below + channels) & keep[1]
+        i, j = base[0] + (below & keep[0]), base[1] + ((below + channels) & keep[1])
         n = int64(nodes[e + 3]) * channels
         for c in range(0, blocks, LANES):
             gc = wide() + g if summed else load(upstream, n + c, wide())
@@ -164,7 +166,7 @@ def _backward(table: Any, summed: Any) -> Any:
     read, upstream = integer(table, 4), vector(table, 5, float32)
     starts, nodes, shares = vector(table, 9, int64), vector(table, 10, int32), vector(table, 11, float32)
     channels, samples, stride = size(table, 1, 1), size(table, 0, 0), size(table, 9, 1)
-    waste = np.zeros(channels, float32)
+    waste = vector(table, 12, float32)
     while True:
         task = next_task(table)
         if task < 0:
@@ -176,15 +178,30 @@ def _backward(table: Any, summed: Any) -> Any:
         for where in range(3):
             first, last = span(starts, axis * stride, size(table, 3 - axis, 0), part, where)
             # What falls on nodes of another task, which sees these samples too, goes to waste.
-            to = waste if where == 0 else own, waste if where == 2 else own
-            keep = int64(0 if where == 0 else -1), int64(0 if where == 2 else -1)
+            low, high = where != 0, where != 2
+            to = own if low else waste, own if high else waste
+            keep = int64(-1 if low else 0), int64(-1 if high else 0)
+            base = int64(0 if low else task * channels), int64(0 if high else task * channels)
             entries = ENTRY * (axis * samples + first), ENTRY * (axis * samples + last)
-            _serve(lines, others, axis, to, keep, (nodes, shares), entries, channels, read, upstream, summed)
+            _serve(
+                lines,
+                others,
+                axis,
+                to,
+                keep,
+                base,
+                (nodes, shares),
+                entries,
+                channels,
+                read,
+                upstream,
+                summed,
+            )
 
 
 @kernel
 def _density_backward(table: Any) -> None:
-    """u, three lines, channels to read, upstream, three line gradients, listing."""
+    """u, three lines, channels to read, upstream, three line gradients, listing, waste."""
     _backward(table, True)
 
 
@@ -213,7 +230,8 @@ def _gradients(
 ) -> list[Tensor]:
     listing = list_by_row(u, upstream, (lines[2].shape[0], lines[1].shape[0], lines[0].shape[0]), 3)
     gradients = [torch.zeros_like(line) for line in lines]
-    launch(compiled, 3 * TASKS, u, *lines, read, upstream, *gradients, *listing)
+    waste = room("waste", 3 * TASKS, lines[0].shape[1]).zero_()
+    launch(compiled, 3 * TASKS, u, *lines, read, upstream, *gradients, *listing, waste)
     return gradients
 
 

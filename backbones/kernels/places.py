@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from backbones.kernels.compiler import float32, inline, int32
 from backbones.kernels.simd import load, one
 
-__all__ = ["BATCH", "axes", "batch", "find", "new_places", "node"]
+__all__ = ["BATCH", "PLACES", "axes", "batch", "find", "node"]
 
 # Samples of a batch: their places fit into the first-level cache.
 BATCH = 256
+# One number for each axis of each of them.
+PLACES = 3 * BATCH
 
 
 @inline
@@ -41,14 +41,11 @@ def node(u: Any, edge: Any) -> Any:
 
 
 @inline
-def new_places() -> Any:
-    """Room for a batch: node below along each of the three axes, and share of the node above."""
-    return np.empty(3 * BATCH, int32), np.empty(3 * BATCH, float32)
-
-
-@inline
 def find(places: Any, u: Any, first: Any, count: Any, shape: Any) -> Any:
-    """Fill ``places`` for ``count`` samples from ``first`` on, on a grid of ``shape`` nodes."""
+    """Find ``count`` samples from ``first`` on, on a grid of ``shape`` nodes.
+
+    ``places`` are two arrays of `PLACES`: node below along each of the three axes, and share of the node above.
+    """
     nodes, shares = places
     for axis in range(3):
         edge = shape[axis]

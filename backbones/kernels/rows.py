@@ -14,8 +14,19 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from backbones.kernels.compiler import float32, inline, int32, int64, integer, kernel, next_task, size, vector
-from backbones.kernels.places import BATCH, find, new_places, node
+from backbones.kernels.compiler import (
+    float32,
+    inline,
+    int32,
+    int64,
+    integer,
+    kernel,
+    next_task,
+    scratch,
+    size,
+    vector,
+)
+from backbones.kernels.places import BATCH, PLACES, find, node
 from backbones.kernels.simd import load, one
 from backbones.kernels.threading import launch
 from backbones.kernels.workspace import room
@@ -43,11 +54,11 @@ class Listing(NamedTuple):
 
 
 @inline
-def _count(rows: Any, starts: Any, begin: Any, samples: Any, stride: Any, edge: Any) -> Any:
+def _count(rows: Any, base: Any, samples: Any, starts: Any, begin: Any, edge: Any) -> Any:
     """Make entry r + 1 the place where row r begins."""
-    for row in range(begin, begin + stride):
+    for row in range(begin, begin + edge + 1):
         starts[row] = 0
-    for n in range(samples):
+    for n in range(base, base + samples):
         starts[begin + rows[n] + 1] += 1
     running = int64(0)
     for row in range(begin + 1, begin + edge + 1):
@@ -62,32 +73,31 @@ def _sort(table: Any) -> None:
     u, upstream = vector(table, 0, float32), vector(table, 1, float32)
     summed = integer(table, 2) != 0
     edges = vector(table, 3, int64)
-    starts, all_rows = vector(table, 4, int64), vector(table, 7, int32)
+    starts, rows = vector(table, 4, int64), vector(table, 7, int32)
     to_nodes, to_shares = vector(table, 5, int32), vector(table, 6, float32)
     samples, stride = size(table, 0, 0), size(table, 4, 1)
     shape = edges[0], edges[1], edges[2]
-    places = new_places()
-    nodes, shares = places
+    nodes, shares = scratch(PLACES, int32), scratch(PLACES, float32)
+    places = nodes, shares
     while True:
         axis = next_task(table)
         if axis < 0:
             break
-        edge, begin = edges[axis], axis * stride
-        rows = all_rows[axis * samples : (axis + 1) * samples]
+        edge, begin, base = edges[axis], axis * stride, axis * samples
         for n in range(samples):
-            rows[n] = node(load(u, 3 * n + axis, one()), edge)[0]
+            rows[base + n] = node(load(u, 3 * n + axis, one()), edge)[0]
         if summed:
             # Behind the last row, and so in no task.
             for n in range(samples):
                 if upstream[n] == float32(0):
-                    rows[n] = edge - 1
-        _count(rows, starts, begin, samples, stride, edge)
+                    rows[base + n] = edge - 1
+        _count(rows, base, samples, starts, begin, edge)
         for first in range(0, samples, BATCH):
             count = min(int64(BATCH), samples - first)
             find(places, u, first, count, shape)
             for q in range(count):
-                row = begin + rows[first + q] + 1
-                to = ENTRY * (axis * samples + starts[row])
+                row = begin + rows[base + first + q] + 1
+                to = ENTRY * (base + starts[row])
                 # Where the row begins moves to where it ends while its samples are listed.
                 starts[row] += 1
                 to_nodes[to] = nodes[q]

@@ -1,11 +1,11 @@
 """Vectors of float32 channels for kernels.
 
-A loop over a channel count known only at run time is compiled to scalar code for short rows, and LLVM cannot prove that
-the gradient rows that a kernel updates do not overlap. So the channel loops say themselves what a vector is: `WIDE` and
-`ONE` are samples of the two types of a channel step, eight float32 or a single one, and ``load(x, i, like)`` gives what
-``like`` is. Written once, a loop body serves the blocks of eight and the rest::
+A loop over a channel count known only at run time is compiled to scalar code for short rows, and LLVM cannot prove
+that the gradient rows that a kernel updates do not overlap. So the channel loops say themselves what a vector is:
+`wide` and `one` give samples of the two types of a channel step, eight float32 or a single one, and
+``load(x, i, like)`` gives what ``like`` is. Written once, a loop body serves the blocks of eight and the rest::
 
-    for c in range(0, blocks, 8): body(c, wide())
+    for c in range(0, blocks, LANES): body(c, wide())
     for c in range(blocks, channels): body(c, one())
 
 ``+``, ``-`` and ``*`` work on eight lanes at once, also with a float32 on either side, and contract to fused
@@ -15,12 +15,13 @@ multiply-adds. LLVM maps eight lanes to whatever the processor has (one AVX regi
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable
 from typing import Any
 
 from llvmlite import ir  # type: ignore[import-untyped]
 from numba import types
-from numba.extending import models, overload, register_model
+from numba.core.imputils import lower_builtin
+from numba.core.typing.templates import AbstractTemplate, infer_global, signature
+from numba.extending import models, register_model
 
 from backbones.kernels.compiler import inline, intrinsic
 
@@ -29,6 +30,7 @@ __all__ = ["LANES", "add_to", "load", "one", "prefetch", "store", "total", "wide
 LANES = 8
 _FLAGS = ("contract", "nsz", "arcp", "reassoc")
 _LLVM = ir.VectorType(ir.FloatType(), LANES)
+_INDEX = ir.IntType(32)
 
 
 class _Lanes(types.Type):
@@ -50,29 +52,41 @@ class _LanesModel(models.PrimitiveModel):  # type: ignore[misc]
 def _element(context: Any, builder: Any, signature: Any, arguments: Any, pointee: Any) -> Any:
     """Pointer to element ``arguments[1]`` of the contiguous 1-D array ``arguments[0]``."""
     array = context.make_array(signature.args[0])(context, builder, arguments[0])
-    return builder.bitcast(builder.gep(array.data, [arguments[1]]), pointee.as_pointer())
+    index = context.cast(builder, arguments[1], signature.args[1], types.int64)
+    return builder.bitcast(builder.gep(array.data, [index]), pointee.as_pointer())
 
 
 def _width(like: Any) -> Any:
     return _LLVM if isinstance(like, _Lanes) else ir.FloatType()
 
 
+def _splat(builder: Any, value: Any) -> Any:
+    """``value`` in every lane."""
+    undefined = ir.Constant(_LLVM, ir.Undefined)
+    mask = ir.Constant(ir.VectorType(_INDEX, LANES), [0] * LANES)
+    return builder.shuffle_vector(builder.insert_element(undefined, value, _INDEX(0)), undefined, mask)
+
+
 @intrinsic
-def _load(context: Any, array: Any, index: Any, like: Any) -> Any:
+def load(context: Any, array: Any, index: Any, like: Any) -> Any:
+    """``load(x, i, like)``: elements from ``i`` on of the 1-D array ``x``, as many as ``like`` has."""
+
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.load(_element(context, builder, signature, arguments, _width(like)), align=4)
 
-    return like(array, types.int64, like), generate
+    return like(array, index, like), generate
 
 
 @intrinsic
-def _store(context: Any, array: Any, index: Any, value: Any) -> Any:
+def store(context: Any, array: Any, index: Any, value: Any) -> Any:
+    """``store(x, i, value)``: write to the elements from ``i`` on of the 1-D array ``x``."""
+
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         pointer = _element(context, builder, signature, arguments, _width(value))
         builder.store(arguments[2], pointer, align=4)
         return context.get_dummy_value()
 
-    return types.void(array, types.int64, value), generate
+    return types.void(array, index, value), generate
 
 
 @intrinsic
@@ -81,113 +95,84 @@ def prefetch(context: Any, array: Any, index: Any) -> Any:
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         pointer = _element(context, builder, signature, arguments, ir.IntType(8))
-        word = ir.IntType(32)
-        kind = ir.FunctionType(ir.VoidType(), [pointer.type, word, word, word])
+        kind = ir.FunctionType(ir.VoidType(), [pointer.type, _INDEX, _INDEX, _INDEX])
         function = builder.module.declare_intrinsic("llvm.prefetch", (pointer.type,), kind)
-        builder.call(function, [pointer, word(0), word(3), word(1)])
+        builder.call(function, [pointer, _INDEX(0), _INDEX(3), _INDEX(1)])
         return context.get_dummy_value()
 
-    return types.void(array, types.int64), generate
+    return types.void(array, index), generate
 
 
 @intrinsic
-def _splat(context: Any, value: Any) -> Any:
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        word = ir.IntType(32)
-        first = builder.insert_element(ir.Constant(_LLVM, ir.Undefined), arguments[0], word(0))
-        mask = ir.Constant(ir.VectorType(word, LANES), [0] * LANES)
-        return builder.shuffle_vector(first, ir.Constant(_LLVM, ir.Undefined), mask)
+def wide(context: Any) -> Any:
+    """``wide()``: eight zeros."""
 
-    return _lanes(types.float32), generate
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return ir.Constant(_LLVM, [0.0] * LANES)
+
+    return _lanes(), generate
 
 
 @intrinsic
-def _sum_lanes(context: Any, value: Any) -> Any:
+def one(context: Any) -> Any:
+    """``one()``: a single zero."""
+
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        word = ir.IntType(32)
+        return ir.Constant(ir.FloatType(), 0.0)
+
+    return types.float32(), generate
+
+
+@intrinsic
+def total(context: Any, value: Any) -> Any:
+    """``total(value)``: sum of the lanes, in pairs; a float32 itself."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         rest, width = arguments[0], LANES
+        if not isinstance(value, _Lanes):
+            return rest
         while width > 1:
             width //= 2
-            halves = [
-                builder.shuffle_vector(
-                    rest,
-                    ir.Constant(rest.type, ir.Undefined),
-                    ir.Constant(ir.VectorType(word, width), list(range(start, start + width))),
-                )
-                for start in (0, width)
-            ]
+            undefined = ir.Constant(rest.type, ir.Undefined)
+            masks = (list(range(start, start + width)) for start in (0, width))
+            kind = ir.VectorType(_INDEX, width)
+            halves = [builder.shuffle_vector(rest, undefined, ir.Constant(kind, mask)) for mask in masks]
             rest = builder.fadd(*halves, flags=_FLAGS)
-        return builder.extract_element(rest, word(0))
+        return builder.extract_element(rest, _INDEX(0))
 
-    return types.float32(_lanes), generate
-
-
-def _binary(name: str) -> Any:
-    def typed(context: Any, left: Any, right: Any) -> Any:
-        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            return getattr(builder, name)(*arguments, flags=_FLAGS)
-
-        return _lanes(_lanes, _lanes), generate
-
-    return intrinsic(typed)
+    return types.float32(value), generate
 
 
-def _overload_operator(symbol: Callable[[Any, Any], Any], name: str) -> None:
-    apply = _binary(name)
+def _define(symbol: Any, instruction: str) -> None:
+    """Give an operator a meaning for vectors, and for a vector and a float32."""
 
-    @overload(symbol)  # type: ignore[untyped-decorator]
-    def choose(left, right):  # type: ignore[no-untyped-def]
-        if isinstance(left, _Lanes) and isinstance(right, _Lanes):
-            return lambda left, right: apply(left, right)
-        if isinstance(left, _Lanes) and right == types.float32:
-            return lambda left, right: apply(left, _splat(right))
-        if left == types.float32 and isinstance(right, _Lanes):
-            return lambda left, right: apply(_splat(left), right)
-        return None
+    @infer_global(symbol)  # type: ignore[no-untyped-call]
+    class _Typed(AbstractTemplate):
+        def generic(self, args: Any, kws: Any) -> Any:
+            vectors = [isinstance(kind, _Lanes) for kind in args]
+            if any(vectors) and all(
+                v or kind == types.float32 for v, kind in zip(vectors, args, strict=True)
+            ):
+                return signature(_lanes, *args)  # type: ignore[no-untyped-call]
+            return None
 
+    def generate(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+        operands = [
+            value if isinstance(kind, _Lanes) else _splat(builder, value)
+            for kind, value in zip(sig.args, arguments, strict=True)
+        ]
+        return getattr(builder, instruction)(*operands, flags=_FLAGS)
 
-_overload_operator(operator.add, "fadd")
-_overload_operator(operator.sub, "fsub")
-_overload_operator(operator.mul, "fmul")
-
-
-@inline
-def wide() -> Any:
-    """Eight zeros."""
-    return _splat(types.float32(0))
-
-
-@inline
-def one() -> Any:
-    """A single zero."""
-    return types.float32(0)
+    for kinds in ((_Lanes, _Lanes), (_Lanes, types.Float), (types.Float, _Lanes)):
+        lower_builtin(symbol, *kinds)(generate)  # type: ignore[no-untyped-call]
 
 
-@inline
-def load(x: Any, i: Any, like: Any) -> Any:
-    """Elements from ``i`` on of the 1-D array ``x``, as many as ``like`` has."""
-    return _load(x, i, like)
-
-
-@inline
-def store(x: Any, i: Any, value: Any) -> Any:
-    """Write ``value`` to the elements from ``i`` on of the 1-D array ``x``."""
-    _store(x, i, value)
+_define(operator.add, "fadd")
+_define(operator.sub, "fsub")
+_define(operator.mul, "fmul")
 
 
 @inline
 def add_to(x: Any, i: Any, value: Any) -> Any:
     """Add ``value`` to the elements from ``i`` on of the 1-D array ``x``."""
-    _store(x, i, _load(x, i, value) + value)
-
-
-def total(value: Any) -> Any:
-    """Sum of the lanes, in kernels."""
-    return value
-
-
-@overload(total)  # type: ignore[untyped-decorator]
-def _total(value):  # type: ignore[no-untyped-def]
-    if isinstance(value, _Lanes):
-        return lambda value: _sum_lanes(value)
-    return lambda value: value
+    store(x, i, load(x, i, value) + value)

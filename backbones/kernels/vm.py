@@ -5,17 +5,27 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from backbones.kernels.compiler import float32, inline, int32, int64, integer, kernel, next_task, size, vector
+from backbones.kernels.compiler import (
+    float32,
+    inline,
+    int32,
+    int64,
+    integer,
+    kernel,
+    next_task,
+    scratch,
+    size,
+    vector,
+)
 from backbones.kernels.lookup import ahead, bilinear, corners, linear, prefetch_cell
-from backbones.kernels.places import BATCH, axes, batch, find, new_places
+from backbones.kernels.places import BATCH, PLACES, axes, batch, find
 from backbones.kernels.simd import LANES, one, store, total, wide
 from backbones.kernels.threading import launch
 
-__all__ = ["density", "features", "plane_sum"]
+__all__ = ["density", "features", "find_cells", "look_up"]
 
 
 @inline
@@ -25,9 +35,7 @@ def _product(grids: Any, at: Any, below: Any, channels: Any, down: Any, w: Any, 
 
 
 @inline
-def plane_sum(
-    grids: Any, at: Any, below: Any, channels: Any, down: Any, w: Any, share: Any, read: Any
-) -> Any:
+def _sum(grids: Any, at: Any, below: Any, channels: Any, down: Any, w: Any, share: Any, read: Any) -> Any:
     """Sum over channels of plane times line; ``at`` and ``below`` are their first elements, ``down`` a row's length."""
     blocks = read - read % LANES
     lanes = wide()
@@ -63,13 +71,49 @@ def _write(
 
 
 @inline
+def find_cells(cells: Any, nodes: Any, count: Any, shape: Any, channels: Any) -> Any:
+    """Write where the cells of a batch begin in the three planes."""
+    for k in range(3):
+        a, b, _ = axes(k)
+        columns, width = int32(shape[b]), int32(channels)
+        for q in range(count):
+            cells[k * BATCH + q] = (nodes[a * BATCH + q] * columns + nodes[b * BATCH + q]) * width
+
+
+@inline
+def look_up(
+    grids: Any, k: Any, cells: Any, places: Any, part: Any, shape: Any, channels: Any, read: Any, out: Any, n: Any,
+    summed: Any,
+) -> Any:  # fmt: skip
+    """Product of plane and line ``k`` at a part (start, stop, count) of a batch whose first sample is ``n``.
+
+    If ``summed``, its sum over channels is added to ``out``, else its channels are written to their place.
+    """
+    nodes, shares = places
+    start, stop, count = part
+    a, b, v = axes(k)
+    down, far = shape[b] * channels, ahead(read)
+    cell = k * BATCH
+    a, b, v = a * BATCH, b * BATCH, v * BATCH
+    for q in range(start, stop):
+        if q + far < count:
+            prefetch_cell(grids[0], int64(cells[cell + q + far]), channels, down, read)
+        at, below, share = int64(cells[cell + q]), int64(nodes[v + q]) * channels, shares[v + q]
+        w = corners(shares[a + q], shares[b + q])
+        if summed:
+            value = _sum(grids, at, below, channels, down, w, share, read)
+            out[n + q] = value if k == 0 else out[n + q] + value
+        else:
+            _write(grids, at, below, channels, down, w, share, read, out, (3 * (n + q) + k) * channels)
+
+
+@inline
 def _forward(table: Any, summed: Any) -> Any:
     u, read, out = vector(table, 0, float32), integer(table, 7), vector(table, 8, float32)
-    samples, channels, far = size(table, 0, 0), size(table, 4, 1), ahead(read)
+    samples, channels = size(table, 0, 0), size(table, 4, 1)
     shape = size(table, 6, 0), size(table, 5, 0), size(table, 4, 0)
-    places = new_places()
-    nodes, shares = places
-    starts = np.empty(BATCH, int32)
+    places = scratch(PLACES, int32), scratch(PLACES, float32)
+    cells = scratch(PLACES, int32)
     while True:
         task = next_task(table)
         if task < 0:
@@ -77,26 +121,10 @@ def _forward(table: Any, summed: Any) -> Any:
         first, last = batch(task, samples)
         count = last - first
         find(places, u, first, count, shape)
+        find_cells(cells, places[0], count, shape, channels)
         for k in range(3):
             grids = vector(table, 1 + k, float32), vector(table, 4 + k, float32)
-            a, b, v = axes(k)
-            a, b, v = a * BATCH, b * BATCH, v * BATCH
-            columns = size(table, 1 + k, 1)
-            down = columns * channels
-            for q in range(count):
-                starts[q] = (nodes[a + q] * int32(columns) + nodes[b + q]) * int32(channels)
-            for q in range(count):
-                if q + far < count:
-                    prefetch_cell(grids[0], int64(starts[q + far]), channels, down, read)
-                at, below, share = int64(starts[q]), int64(nodes[v + q]) * channels, shares[v + q]
-                w = corners(shares[a + q], shares[b + q])
-                n = first + q
-                if summed:
-                    value = plane_sum(grids, at, below, channels, down, w, share, read)
-                    out[n] = value if k == 0 else out[n] + value
-                else:
-                    to = (3 * n + k) * channels
-                    _write(grids, at, below, channels, down, w, share, read, out, to)
+            look_up(grids, k, cells, places, (0, count, count), shape, channels, read, out, first, summed)
 
 
 @kernel

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -61,10 +60,10 @@ def _add(
 
 @inline
 def _serve(
-    grids: Any, to_plane: Any, to: Any, keep: Any, listing: Any, entries: Any, places: Any, columns: Any,
+    grids: Any, to_plane: Any, to: Any, keep: Any, base: Any, listing: Any, entries: Any, places: Any, columns: Any,
     channels: Any, read: Any, upstream: Any, summed: Any,
 ) -> Any:  # fmt: skip
-    """Add the gradients of a range of entries; what is not kept goes to the first elements of its array."""
+    """Add the gradients of a range of entries; what is not kept goes to the first elements after its base."""
     nodes, shares = listing
     a, b, v, k = places
     blocks = read - read % LANES
@@ -81,7 +80,8 @@ def _serve(
         at = (int64(nodes[e + a]) * columns + int64(nodes[e + b])) * channels
         below, share = int64(nodes[e + v]) * channels, shares[e + v]
         w = corners(shares[e + a], shares[e + b])
-        i, j, m = at & keep[0], (at + down) & keep[1], below & keep[0]
+        i, j = base[0] + (at & keep[0]), base[1] + ((at + down) & keep[1])
+        m = base[2] + (below & keep[0])
         g = shares[e + 3]
         n = (3 * int64(nodes[e + 3]) + k) * channels
         for c in range(0, blocks, LANES):
@@ -93,26 +93,25 @@ def _serve(
 
 
 @inline
-def _own_line(table: Any, k: Any, part: Any, channels: Any) -> Any:
-    """The copy of line ``k``'s gradient that belongs to a task, set to 0."""
+def _clear_line(table: Any, k: Any, part: Any, channels: Any) -> Any:
+    """Set a task's copy of line ``k``'s gradient to 0, and return where it begins."""
     first = part * size(table, 12, 1)
     if k > 0:
         first += size(table, 4, 0)
     if k > 1:
         first += size(table, 5, 0)
     copies = vector(table, 12, float32)
-    own = copies[first * channels : (first + size(table, 4 + k, 0)) * channels]
-    for i in range(own.shape[0]):
-        own[i] = float32(0)
-    return own
+    for i in range(first * channels, (first + size(table, 4 + k, 0)) * channels):
+        copies[i] = float32(0)
+    return first * channels
 
 
 @inline
 def _backward(table: Any, summed: Any) -> Any:
-    read, upstream = integer(table, 7), vector(table, 8, float32)
+    read, upstream, copies = integer(table, 7), vector(table, 8, float32), vector(table, 12, float32)
     starts, nodes, shares = vector(table, 13, int64), vector(table, 14, int32), vector(table, 15, float32)
+    waste = vector(table, 16, float32)
     channels, samples, stride = size(table, 4, 1), size(table, 0, 0), size(table, 13, 1)
-    waste = np.zeros(2 * channels, float32)
     while True:
         task = next_task(table)
         if task < 0:
@@ -120,28 +119,26 @@ def _backward(table: Any, summed: Any) -> Any:
         k, part = task // TASKS, task % TASKS
         grids = vector(table, 1 + k, float32), vector(table, 4 + k, float32)
         to_plane = vector(table, 9 + k, float32)
-        to_line = _own_line(table, k, part, channels)
+        line, bin_ = _clear_line(table, k, part, channels), 2 * task * channels
         a, b, v = axes(k)
         rows, columns = size(table, 1 + k, 0), size(table, 1 + k, 1)
         for where in range(3):
             first, last = span(starts, a * stride, rows, part, where)
             # What falls on rows of another task, which sees these samples too, goes to waste.
-            to = (
-                waste if where == 0 else to_plane,
-                waste if where == 2 else to_plane,
-                waste if where == 0 else to_line,
-            )
-            keep = int64(0 if where == 0 else -1), int64(0 if where == 2 else -1)
+            low, high = where != 0, where != 2
+            to = to_plane if low else waste, to_plane if high else waste, copies if low else waste
+            keep = int64(-1 if low else 0), int64(-1 if high else 0)
+            base = int64(0) if low else bin_, int64(0) if high else bin_, line if low else bin_
             entries = ENTRY * (a * samples + first), ENTRY * (a * samples + last)
             _serve(
-                grids, to_plane, to, keep, (nodes, shares), entries, (a, b, v, k), columns, channels, read,
+                grids, to_plane, to, keep, base, (nodes, shares), entries, (a, b, v, k), columns, channels, read,
                 upstream, summed,
             )  # fmt: skip
 
 
 @kernel
 def _density_backward(table: Any) -> None:
-    """u, planes, lines, channels to read, upstream, plane gradients, line copies, listing."""
+    """u, planes, lines, channels to read, upstream, plane gradients, line copies, listing, waste."""
     _backward(table, True)
 
 
@@ -163,7 +160,8 @@ def _run(
     nodes = [line.shape[0] for line in lines]
     listing = list_by_row(u, upstream, (nodes[2], nodes[1], nodes[0]), 2)
     copies = room("copies", TASKS, sum(nodes), lines[0].shape[1])
-    launch(compiled, 3 * TASKS, u, *planes, *lines, read, upstream, *plane_gradients, copies, *listing)
+    waste = room("waste", 3 * TASKS, 2, lines[0].shape[1]).zero_()
+    launch(compiled, 3 * TASKS, u, *planes, *lines, read, upstream, *plane_gradients, copies, *listing, waste)
     return list(torch.split(copies.sum(0), nodes))
 
 
