@@ -63,7 +63,7 @@ def _none() -> list[Regularizer]:
 
 def _tensorf() -> list[Regularizer]:
     """TensoRF (Chen et al., ECCV 2022): L1 of the density grids, halved at the first occupancy mask."""
-    return [L1("density", weight=Piecewise(values=(8e-5, 4e-5), steps=(2000,)))]
+    return [L1("density", weight=Piecewise(values=(8e-5, 4e-5), steps=(2 / 15,)))]
 
 
 def _few_tensorf() -> list[Regularizer]:
