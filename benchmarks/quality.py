@@ -49,6 +49,7 @@ def score(folder: Path, run: str, seed: int, steps: int | None, protocol: str, b
     if metrics is None:
         raise KeyboardInterrupt
     metrics["config"] = {**metrics["config"], "scene": folder.name}
+    RESULTS.mkdir(parents=True, exist_ok=True)
     metrics["run"] = run
     metrics["command"] = [
         "benchmarks/quality.py",

@@ -244,7 +244,7 @@ def test_fields_are_found_by_name():
     assert "vm" in field_names()
     bounds = torch.tensor([[-1.0] * 3, [1.0] * 3])
     assert make_field("vm", bounds, (4, 4, 4)).resolution == (4, 4, 4)
-    with pytest.raises(InputError, match="backbone: found 'vmm', expected one of .*; did you mean 'vm'"):
+    with pytest.raises(InputError, match=r"backbone: found 'vmm', expected one of .*; did you mean 'vm'"):
         make_field("vmm", bounds, (4, 4, 4))
     with pytest.raises(InputError, match=r"backbone 'vm': .*colour_components"):
         make_field("vm", bounds, (4, 4, 4), colour_components=3)
