@@ -36,7 +36,7 @@ Posed = list[tuple[str, np.ndarray, np.ndarray]]
 
 @pytest.fixture(scope="module")
 def original(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Scene]:
-    folder = builtin_scene(tmp_path_factory.mktemp("scenes"), size=SIZE)
+    folder = builtin_scene(tmp_path_factory.getbasetemp() / "scenes", size=SIZE)
     return folder, load_scene(folder, "first18", test=[])
 
 

@@ -23,7 +23,7 @@ SIZE = 16
 
 @pytest.fixture(scope="module")
 def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return builtin_scene(tmp_path_factory.mktemp("scenes"), size=SIZE)
+    return builtin_scene(tmp_path_factory.getbasetemp() / "scenes", size=SIZE)
 
 
 def turned(degrees: float) -> np.ndarray:

@@ -8,7 +8,6 @@ Ray directions need no unit length: parameters scale with them.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,42 +18,6 @@ Array = NDArray[np.float64]
 
 _TINY = 1e-12
 _ON_SURFACE = 1e-9
-
-
-class Solid(Protocol):
-    """A convex body around (or on) the origin of its frame."""
-
-    @property
-    def middle(self) -> tuple[float, float, float]:
-        """Centre of a ball that contains the body."""
-
-    @property
-    def reach(self) -> float:
-        """Radius of that ball."""
-
-    @property
-    def area(self) -> float:
-        """Surface area, square world units."""
-
-    def intersect(self, origin: Array, direction: Array) -> Array:
-        """Return the smallest positive ray parameter at the surface, ``inf`` where there is none.
-
-        Args:
-            origin: ``(3,)``, common to all rays.
-            direction: ``(3, ...)``.
-
-        Returns:
-            ``(...)``.
-        """
-
-    def distance(self, points: Array) -> Array:
-        """Return the signed distance of ``(N, 3)`` points, negative inside."""
-
-    def normal(self, points: Array) -> Array:
-        """Return the outward unit normal at ``(N, 3)`` points on the surface."""
-
-    def sample(self, count: int, rng: np.random.Generator) -> Array:
-        """Return ``(count, 3)`` points uniform on the surface."""
 
 
 def turned(vectors: Array, matrix: Array) -> Array:
@@ -100,7 +63,15 @@ class Ball:
         return 4 * np.pi * self.radius**2
 
     def intersect(self, origin: Array, direction: Array) -> Array:
-        """See :class:`Solid`."""
+        """Return the smallest positive ray parameter at the surface, ``inf`` where there is none.
+
+        Args:
+            origin: ``(3,)``, common to all rays.
+            direction: ``(3, ...)``, of any length.
+
+        Returns:
+            ``(...)``.
+        """
         a = (direction * direction).sum(axis=0)
         b = np.tensordot(origin, direction, axes=1)
         inside_root = b * b - a * (origin @ origin - self.radius**2)
@@ -109,15 +80,15 @@ class Ball:
         return np.where(inside_root < 0, np.inf, t)
 
     def distance(self, points: Array) -> Array:
-        """See :class:`Solid`."""
+        """Return the signed distance of ``(N, 3)`` points, ``(N,)``, negative inside."""
         return np.asarray(np.linalg.norm(points, axis=-1) - self.radius)
 
     def normal(self, points: Array) -> Array:
-        """See :class:`Solid`."""
+        """Return the outward unit normals at ``(N, 3)`` points on the surface."""
         return np.asarray(points / np.linalg.norm(points, axis=-1, keepdims=True))
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
-        """See :class:`Solid`."""
+        """Return ``(count, 3)`` points uniform on the surface."""
         return self.radius * self.normal(rng.standard_normal((count, 3)))
 
 
@@ -144,7 +115,15 @@ class Block:
         return 8 * (x * y + y * z + z * x)
 
     def intersect(self, origin: Array, direction: Array) -> Array:
-        """See :class:`Solid`."""
+        """Return the smallest positive ray parameter at the surface, ``inf`` where there is none.
+
+        Args:
+            origin: ``(3,)``, common to all rays.
+            direction: ``(3, ...)``, of any length.
+
+        Returns:
+            ``(...)``.
+        """
         entry: Array = np.full(direction.shape[1:], -np.inf)
         leave: Array = np.full(direction.shape[1:], np.inf)
         for axis in range(3):
@@ -156,13 +135,13 @@ class Block:
         return np.where(entry > leave, np.inf, _nearest(entry, leave))
 
     def distance(self, points: Array) -> Array:
-        """See :class:`Solid`."""
+        """Return the signed distance of ``(N, 3)`` points, ``(N,)``, negative inside."""
         gap = np.abs(points) - self.half
         outside = np.linalg.norm(np.maximum(gap, 0), axis=-1)
         return np.asarray(outside + np.minimum(gap.max(axis=-1), 0))
 
     def normal(self, points: Array) -> Array:
-        """See :class:`Solid`."""
+        """Return the outward unit normals at ``(N, 3)`` points on the surface."""
         axis = (np.abs(points) - self.half).argmax(axis=-1)
         rows = np.arange(len(points))
         normals = np.zeros_like(points)
@@ -170,7 +149,7 @@ class Block:
         return normals
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
-        """See :class:`Solid`."""
+        """Return ``(count, 3)`` points uniform on the surface."""
         half = np.array(self.half)
         faces = np.array([half[1] * half[2], half[2] * half[0], half[0] * half[1]])
         axis = rng.choice(3, count, p=faces / faces.sum())
@@ -208,7 +187,15 @@ class Frustum:
         return float(np.pi * (self.low**2 + self.high**2 + (self.low + self.high) * self._slant))
 
     def intersect(self, origin: Array, direction: Array) -> Array:
-        """See :class:`Solid`."""
+        """Return the smallest positive ray parameter at the surface, ``inf`` where there is none.
+
+        Args:
+            origin: ``(3,)``, common to all rays.
+            direction: ``(3, ...)``, of any length.
+
+        Returns:
+            ``(...)``.
+        """
         slope = (self.high - self.low) / self.height
         x, y, z = direction
         ring = self.low + slope * origin[2]
@@ -233,7 +220,7 @@ class Frustum:
         return nearest
 
     def distance(self, points: Array) -> Array:
-        """See :class:`Solid`."""
+        """Return the signed distance of ``(N, 3)`` points, ``(N,)``, negative inside."""
         radius, level = np.hypot(points[:, 0], points[:, 1]), points[:, 2]
         half = self.height / 2
         cap_x = radius - np.minimum(radius, np.where(level < half, self.low, self.high))
@@ -246,7 +233,7 @@ class Frustum:
         return np.asarray(np.where(inside, -1, 1) * np.sqrt(squared))
 
     def normal(self, points: Array) -> Array:
-        """See :class:`Solid`."""
+        """Return the outward unit normals at ``(N, 3)`` points on the surface."""
         radius = np.hypot(points[:, 0], points[:, 1])
         outward = np.where(
             radius[:, None] > _TINY, points[:, :2] / _away_from_zero(radius)[:, None], [1.0, 0.0]
@@ -263,7 +250,7 @@ class Frustum:
         return normals
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
-        """See :class:`Solid`."""
+        """Return ``(count, 3)`` points uniform on the surface."""
         parts = np.array([self.low**2, self.high**2, (self.low + self.high) * self._slant])
         part = rng.choice(3, count, p=parts / parts.sum())
         u, angle = rng.uniform(size=count), rng.uniform(0, 2 * np.pi, count)
@@ -273,3 +260,7 @@ class Frustum:
         share = (on_side - self.low) / grown if grown else u
         level = np.choose(part, [np.zeros(count), np.full(count, self.height), share * self.height])
         return np.stack([radius * np.cos(angle), radius * np.sin(angle), level], axis=-1)
+
+
+Solid = Ball | Block | Frustum
+"""A convex body, on or around the origin of its frame."""
