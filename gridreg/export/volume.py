@@ -116,14 +116,17 @@ def sample_density(density: SeenDensity, bounds: Tensor, resolution: int) -> Den
 
 
 def surface_threshold(volume: DensityVolume) -> float:
-    """Half of the density at which rays along the axes have lost half of their light.
+    """The density at which a surface casts the same shadows along the axes as the field does.
 
-    Each ray along an axis, in both directions and through every node, has a first node at which its
-    transmittance falls to 1/2: there the surface is seen (the ray's median depth). The median of the
-    densities at these nodes, halved, is the threshold. For a solid of one density this is half of it,
-    wherever that may lie, and it does not depend on the resolution, as the density of "half opaque over one
-    voxel" does: that one makes a soft object shrink and vanish as the voxels get smaller. Haze in front of a
-    surface does not move it, because haze takes less than half of the light of most rays.
+    Of all rays along the axes through the nodes, ``k`` lose at least half of their light. A surface at some
+    density is hit by the rays whose largest density lies above it; at the density between the k-th and the
+    next largest of these, it is hit by ``k`` rays. What is seen against the background is so neither swollen
+    nor worn off, and, unlike the density that is half opaque over one voxel, this one does not grow with the
+    resolution, at which soft objects vanish.
+
+    A solid of one low density has rays through its rim that lose little light, which would put the surface
+    right on that density. So the result is at most half of the density at which rays have lost half of their
+    light, in the median.
 
     Returns:
         Density per world unit.
@@ -131,20 +134,23 @@ def surface_threshold(volume: DensityVolume) -> float:
     Raises:
         InputError: if no ray along an axis loses half of its light: the field is empty.
     """
-    taking: list[Array] = []
-    strongest = 0.0
+    half = math.log(2)
+    taking, largest, opaque_rays, strongest = [], [], 0, 0.0
     for axis in range(3):
         forwards = np.moveaxis(volume.values, axis, 0)
+        largest.append(forwards.max(axis=0).ravel())
         for along in (forwards, forwards[::-1]):
             depth = np.cumsum(along, axis=0, dtype=np.float32) * np.float32(volume.spacing[axis])
-            strongest = max(strongest, float(depth[-1].max()))
-            opaque = depth[-1] >= math.log(2)
-            first = np.argmax(depth >= math.log(2), axis=0)
+            opaque = depth[-1] >= half
+            first = np.argmax(depth >= half, axis=0)
             taking.append(np.take_along_axis(along, first[None], axis=0)[0][opaque])
-    densities = np.concatenate(taking)
-    if not densities.size:
+        opaque_rays += int(opaque.sum())
+        strongest = max(strongest, float(depth[-1].max()))
+    if not opaque_rays:
         raise InputError(
             f"field: no ray along an axis of the box is more than {-math.expm1(-strongest):.3g} opaque, "
             "expected 0.5 for a surface; give a threshold (density per world unit) if something is there"
         )
-    return float(np.median(densities)) / 2
+    ordered = np.append(np.sort(np.concatenate(largest))[::-1], np.float32(0))
+    shadows = (float(ordered[opaque_rays - 1]) + float(ordered[opaque_rays])) / 2
+    return min(shadows, float(np.median(np.concatenate(taking))) / 2)
