@@ -29,7 +29,7 @@ class CPField(TensorialField):
         resolution: nodes along x, y, z.
         density_components, appearance_components: channels ``C`` of the lines (96 and 288 in TensoRF).
         scale: standard deviation of the initial values (0.2 in TensoRF's program).
-        generator: for the initial values.
+        generator: for the initial values, of the networks too.
         options: of `TensorialField`.
 
     Example:
@@ -49,7 +49,7 @@ class CPField(TensorialField):
         generator: torch.Generator | None = None,
         **options: Any,
     ) -> None:
-        super().__init__(bounds, resolution, appearance_components, **options)
+        super().__init__(bounds, resolution, appearance_components, generator=generator, **options)
         self.density_lines = _lines(resolution, density_components, scale, generator)
         self.appearance_lines = _lines(resolution, appearance_components, scale, generator)
 

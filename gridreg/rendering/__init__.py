@@ -2,11 +2,21 @@
 
 from gridreg.rendering.occupancy import OccupancyGrid, visual_hull
 from gridreg.rendering.rays import Rays, box_intersection, camera_rays, pixel_rays
-from gridreg.rendering.render import Field, March, Rendered, SampleHook, composite, render_image, render_rays
+from gridreg.rendering.render import (
+    Field,
+    March,
+    Marched,
+    Rendered,
+    SampleHook,
+    composite,
+    render_image,
+    render_rays,
+)
 
 __all__ = [
     "Field",
     "March",
+    "Marched",
     "OccupancyGrid",
     "Rays",
     "Rendered",

@@ -13,11 +13,16 @@ from gridreg.rendering.occupancy import OccupancyGrid
 from gridreg.rendering.rays import Rays, box_intersection, camera_rays
 from gridreg.samples import RaySamples
 
-__all__ = ["Field", "March", "Rendered", "SampleHook", "render_image", "render_rays"]
+__all__ = ["Field", "March", "Marched", "Rendered", "SampleHook", "render_image", "render_rays"]
 
 
 class Field(Protocol):
-    """What the renderer asks of a field; a field may also offer `march_density` and `colour_of_rays`."""
+    """What the renderer asks of a field.
+
+    It may also offer ``march_density(rays, t_min, t_max, step, occupancy, jitter, transmittance_bound)``, which returns
+    `Marched`; ``colour_of_rays(x, directions, ray_indices)``, which takes directions ``(R, 3)`` by ray; and
+    ``colour_of_features(features, directions, ray_indices)`` for the features that its march returned.
+    """
 
     bounds: Tensor
 
@@ -74,6 +79,34 @@ class Rendered:
     samples: RaySamples | None = None
 
 
+@dataclass(frozen=True)
+class Marched:
+    """The samples that a march kept, packed by ray, and their density.
+
+    A field's own `march_density` may return a plain tuple of the first five or more.
+
+    Args:
+        offsets: ``(R + 1,)`` int64.
+        index: ``(N,)`` int64, number of the sample on its ray, skipped ones included.
+        t: ``(N,)`` distance along the ray, world units.
+        positions: ``(N, 3)``, world units.
+        density: ``(N,)`` per world unit.
+        delta: ``(N,)`` length of the sample's interval, world units; None: one step.
+        ray_steps: ``(R,)`` int64, samples of each ray, skipped ones included; None: as the step says, or with
+            ``delta`` up to the last one kept.
+        features: ``(N, F)`` for the field's `colour_of_features`, or None.
+    """
+
+    offsets: Tensor
+    index: Tensor
+    t: Tensor
+    positions: Tensor
+    density: Tensor
+    delta: Tensor | None = None
+    ray_steps: Tensor | None = None
+    features: Tensor | None = None
+
+
 def _march(
     field: Any,
     rays: Rays,
@@ -81,15 +114,13 @@ def _march(
     occupancy: OccupancyGrid,
     march: March,
     jitter: Tensor,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Offsets, index, t, positions and density of the samples that are not hidden."""
+) -> Marched:
+    """The samples that are not hidden."""
     t_min, t_max = t_range
     fused = getattr(field, "march_density", None)
     if fused is not None:
-        found: tuple[Tensor, Tensor, Tensor, Tensor, Tensor] = fused(
-            rays, t_min, t_max, march.step, occupancy, jitter, march.transmittance_bound
-        )
-        return found
+        found = fused(rays, t_min, t_max, march.step, occupancy, jitter, march.transmittance_bound)
+        return found if isinstance(found, Marched) else Marched(*found)
     offsets, index, t, positions = backends.march(
         rays.origins, rays.directions, t_min, t_max, march.step, occupancy.cells, occupancy.bounds, jitter
     )
@@ -98,7 +129,7 @@ def _march(
         kept = backends.terminate(density.detach() * march.step, offsets, march.transmittance_bound)
         offsets = _offsets_of(kept, offsets)
         index, t, positions, density = index[kept], t[kept], positions[kept], density[kept]
-    return offsets, index, t, positions, density
+    return Marched(offsets, index, t, positions, density)
 
 
 def _offsets_of(kept: Tensor, offsets: Tensor) -> Tensor:
@@ -107,7 +138,14 @@ def _offsets_of(kept: Tensor, offsets: Tensor) -> Tensor:
     return running[offsets]
 
 
-def _colours(field: Any, positions: Tensor, rays: Rays, ray_indices: Tensor) -> Tensor:
+def _colours(field: Any, marched: Marched, chosen: Tensor, rays: Rays, ray_indices: Tensor) -> Tensor:
+    """Colours of some of the samples."""
+    if marched.features is not None:
+        of_features = field.colour_of_features(
+            marched.features.index_select(0, chosen), rays.directions, ray_indices
+        )
+        return of_features  # type: ignore[no-any-return]
+    positions = marched.positions[chosen]
     by_ray = getattr(field, "colour_of_rays", None)
     if by_ray is not None:
         colours: Tensor = by_ray(positions, rays.directions, ray_indices)
@@ -142,24 +180,27 @@ def render_rays(
         jitter = torch.full((len(rays),), 0.5, dtype=rays.origins.dtype, device=rays.origins.device)
     near, far = (march.near, march.far) if near_far is None else near_far
     t_min, t_max = box_intersection(rays, field.bounds, near, far)
-    offsets, index, t, positions, density = _march(field, rays, (t_min, t_max), occupancy, march, jitter)
-    delta = torch.full_like(t, march.step)
+    marched = _march(field, rays, (t_min, t_max), occupancy, march, jitter)
+    delta, ray_steps = marched.delta, marched.ray_steps
+    if delta is None:
+        delta = torch.full_like(marched.t, march.step)
+        ray_steps = ((t_max - t_min) / march.step - jitter).ceil().clamp(min=0).long()
     samples = RaySamples(
-        offsets=offsets,
-        t=t,
+        offsets=marched.offsets,
+        t=marched.t,
         delta=delta,
-        index=index,
-        density=density,
-        weights=backends.composite_weights(density * march.step, offsets),
-        positions=positions,
+        index=marched.index,
+        density=marched.density,
+        weights=backends.composite_weights(marched.density * delta, marched.offsets),
+        positions=marched.positions,
         directions=rays.directions,
         ray_start=t_min,
-        ray_steps=((t_max - t_min) / march.step - jitter).ceil().clamp(min=0).long(),
+        ray_steps=ray_steps,
     )
     visible = samples.weights.detach() > march.weight_bound
     chosen = visible.nonzero().squeeze(-1)
-    seen_colours = _colours(field, positions[chosen], rays, samples.ray_indices[chosen])
-    colours = torch.zeros_like(positions).index_put((chosen,), seen_colours)
+    seen_colours = _colours(field, marched, chosen, rays, samples.ray_indices[chosen])
+    colours = torch.zeros_like(marched.positions).index_put((chosen,), seen_colours)
     samples = samples.replace(colours=colours, background=background.expand(len(rays), 3))
     if hook is not None:
         samples = hook.on_samples(samples)

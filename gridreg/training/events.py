@@ -145,9 +145,10 @@ def run(trainer: Trainer) -> None:
     regular = settings.occupancy_every and started and step % settings.occupancy_every == 0
     if step in settings.occupancy_at or regular:
         update_occupancy(trainer)
-    if step in settings.shrink_at:
+    # A field without a grid, such as a coordinate network, has nothing to crop or to refine.
+    if step in settings.shrink_at and hasattr(trainer.field, "shrink"):
         shrink(trainer)
     if step in settings.filter_rays_at:
         filter_rays(trainer)
-    if step in settings.resample_at:
+    if step in settings.resample_at and hasattr(trainer.field, "resample"):
         resample(trainer)

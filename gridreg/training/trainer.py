@@ -30,8 +30,8 @@ class Trainer:
     """Trains a field on a scene, one iteration at a time; all that changes is in `state` and the field.
 
     Args:
-        field: a `gridreg.rendering.Field` module that also offers ``parameter_groups()``, and for the events
-            ``resample(resolution)`` and ``shrink(bounds)``.
+        field: a `gridreg.rendering.Field` module that also offers ``parameter_groups()``. ``resample(resolution)`` and
+            ``shrink(bounds)`` are called if it has them.
         scene: training views and box.
         composition: regularizers, attached here with `gridreg.apply`.
         settings: the schedule.
