@@ -229,7 +229,7 @@ def render_image(
     march: March,
     *,
     background: Tensor,
-    chunk: int = 1 << 14,
+    chunk: int = 1 << 12,
 ) -> Rendered:
     """Render one picture; the result does not depend on ``chunk``.
 
