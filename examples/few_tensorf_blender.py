@@ -54,6 +54,9 @@ def main(options: TrainOptions) -> int:
 if __name__ == "__main__":
     try:
         sys.exit(main(tyro.cli(TrainOptions)))
+    except KeyboardInterrupt:
+        print("stopped; --resume goes on from the last checkpoint", file=sys.stderr)
+        sys.exit(130)
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)

@@ -117,8 +117,12 @@ class Execution:
         self.history.add(trainer.step, {name: value, "seconds": self.seconds["train"]})
         progress.message(f"step {trainer.step}: {name.replace('_', ' ')} {value:.2f} dB")
 
-    def score(self, progress: Progress) -> list[Scored]:
-        """Render and score the test views, each written as soon as it is done."""
+    def score(self, progress: Progress, interruption: Interruption) -> list[Scored]:
+        """Render and score the test views, each written as soon as it is done.
+
+        Raises:
+            KeyboardInterrupt: if it was interrupted; the training before it is saved.
+        """
         trainer = self.trainer
         folder = check_output_folder(self.out / "test")
         began = time.perf_counter()
@@ -138,6 +142,8 @@ class Execution:
             )
             done.append(view)
             progress.update(len(done), psnr=view.metrics["psnr"])
+            if interruption.requested:
+                raise KeyboardInterrupt
 
         done: list[Scored] = []
         scored = score_views(
@@ -234,5 +240,5 @@ def execute(
             print(f"stopped at step {trainer.step}; go on with --resume --out {folder}", file=sys.stderr)
             return run, None
         with Progress(len(scene.test), label="test view") as progress:
-            scored = run.score(progress)
+            scored = run.score(progress, interruption)
     return run, run.record(scored, command)
