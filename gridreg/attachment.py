@@ -79,6 +79,9 @@ class Attachment:
             row.matches, row.slots = matches, slots
             for match, slot in slots:
                 attach(match, slot)
+        # What belonged to tensors that are gone would not fit the field that loads the state.
+        used = {id(slot.context) for row in self.rows for _, slot in row.slots}
+        self._contexts = {key: context for key, context in self._contexts.items() if id(context) in used}
         self._structure = _structure(self.field)
 
     def detach(self) -> None:
@@ -140,8 +143,9 @@ class Attachment:
         """A slot with the context of this place, the one from before if the channels are the same."""
         key = (row.name, match.place.kind, match.place.name)
         context = self._contexts.get(key)
-        if context is not None and context.place is not None and match.place.size is None:
-            match.place.complete(context.place.size) if context.place.size is not None else None
+        width = None if context is None or context.place is None else context.place.size
+        if match.place.size is None and width is not None:
+            match.place.complete(width)
         if context is None or context.place is None or context.place.channels != match.place.channels:
             context = self._contexts[key] = Context(self.clock)
         context.place = match.place

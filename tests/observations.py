@@ -26,8 +26,11 @@ def sites_for(cls: type[Regularizer], design: Design) -> tuple[SiteLike, ...]:
 
 
 def examples_on(cls: type[Regularizer], design: Design) -> list[Regularizer]:
-    """Every example of a class at every site of a design."""
-    return [example for site in sites_for(cls, design) for example in cls.examples(site)]
+    """Every example of a class, and every site of a design at least once: the examples take turns."""
+    sites = sites_for(cls, design)
+    at_site = [cls.examples(site) for site in sites]
+    count = max(len(sites), len(at_site[0])) if at_site[0] else 0
+    return [at_site[i % len(sites)][i % len(at_site[0])] for i in range(count)]
 
 
 def samples_of(field: nn.Module) -> gridreg.RaySamples:

@@ -156,6 +156,22 @@ def test_a_state_loaded_before_the_first_call_is_kept() -> None:
         assert same(outputs(first), outputs(second))
 
 
+def test_the_state_follows_the_tensors_that_are_there() -> None:
+    field, other = made("tensorf"), made("tensorf")
+    mask = gridreg.FrequencyMask(LINE, until=10)
+    with (
+        gridreg.apply(field, mask, total_steps=10) as handle,
+        gridreg.apply(other, mask, total_steps=10) as twin,
+    ):
+        for part, owner in ((field, handle), (other, twin)):
+            with owner.suspended():
+                part.app_line = nn.ParameterList(list(part.app_line)[:2])
+        handle.step(4)
+        assert [key.split("/")[2] for key in handle.state_dict()["state"]] == ["app_line.0", "app_line.1"]
+        twin.load_state_dict(handle.state_dict())
+        assert torch.equal(field.app_line[0], other.app_line[0])
+
+
 @pytest.mark.parametrize(
     ("change", "text"),
     [
