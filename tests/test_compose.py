@@ -218,7 +218,9 @@ def test_few_tensorf_has_the_settings_of_its_paper() -> None:
     ]
     assert all(mask.until == 1.0 and mask.variant == "block" for mask in masks)
     assert gridreg.OcclusionLoss(weight=0.01, samples=20) in few
-    assert gridreg.composition("tensorf") == [gridreg.L1("density", gridreg.Piecewise((8e-5, 4e-5), (2 / 15,)))]
+    assert gridreg.composition("tensorf") == [
+        gridreg.L1("density", gridreg.Piecewise((8e-5, 4e-5), (2 / 15,)))
+    ]
     assert {r.weight for r in few if isinstance(r, (gridreg.TotalVariation, gridreg.Orthogonality))} == {0.01}
     authors = gridreg.composition("few_tensorf_authors")
     masks = [r for r in authors if isinstance(r, gridreg.FrequencyMask)]
