@@ -1,0 +1,50 @@
+"""What the site does to its pages: pictures go inline, and nothing may come from another server."""
+
+from __future__ import annotations
+
+import html
+import re
+from pathlib import Path
+from typing import Any
+
+_PICTURE = re.compile(r'<img alt="([^"]*)" src="(?:\.\./)*(pictures/[\w-]+\.svg)" ?/?>')
+_FOREIGN = re.compile(
+    r'<(?:script|img|iframe|source)\b[^>]*\bsrc="(?:https?:)?//[^"]*"'
+    r'|<link\b[^>]*\bhref="(?:https?:)?//[^"]*"'
+    r"|(?:@import\s+|url\()[\"']?(?:https?:)?//[^\"')]*"
+)
+
+
+def on_page_content(text: str, config: Any, **_: Any) -> str:
+    """A page's HTML with its pictures inside, so that they follow the page's colours."""
+    return inlined(text, Path(config["docs_dir"]))
+
+
+def inlined(text: str, docs: Path) -> str:
+    """HTML in which the project's own pictures are no longer references to files."""
+
+    def drawing(found: re.Match[str]) -> str:
+        svg = (docs / found[2]).read_text(encoding="utf-8")
+        # The page's stylesheet takes the place of the file's own, which knows nothing of the page's switch.
+        svg = re.sub(r"<style>.*?</style>", "", svg, flags=re.S).replace(
+            ' xmlns="http://www.w3.org/2000/svg"', ""
+        )
+        return svg.replace("<svg ", f'<svg role="img" aria-label="{found[1]}" ', 1).strip()
+
+    return _PICTURE.sub(drawing, text)
+
+
+def foreign(text: str) -> list[str]:
+    """What an HTML or CSS file would fetch from another server."""
+    return [html.unescape(found[0]) for found in _FOREIGN.finditer(text)]
+
+
+def on_post_build(config: Any, **_: Any) -> None:
+    """Refuse a site that needs another server."""
+    from mkdocs.exceptions import PluginError
+
+    site = Path(config["site_dir"])
+    for path in sorted([*site.rglob("*.html"), *site.rglob("*.css")]):
+        found = foreign(path.read_text(encoding="utf-8"))
+        if found:
+            raise PluginError(f"{path.relative_to(site)}: fetches from elsewhere: {found[0]}")
