@@ -31,7 +31,7 @@ class Page:
         for domain in ("Page", "Runtime", "Log"):
             self.call(f"{domain}.enable")
 
-    def call(self, method: str, timeout: float = 60.0, **parameters: Any) -> dict[str, Any]:
+    def call(self, method: str, timeout: float = 90.0, **parameters: Any) -> dict[str, Any]:
         """One command of the protocol; what the page says meanwhile is collected."""
         self._last += 1
         self._socket.send(json.dumps({"id": self._last, "method": method, "params": parameters}))
@@ -68,7 +68,7 @@ class Page:
         data = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
         return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
 
-    def until(self, condition: Callable[[], Any], seconds: float = 60.0) -> Any:
+    def until(self, condition: Callable[[], Any], seconds: float = 90.0) -> Any:
         """Wait for a condition; its value."""
         end = time.monotonic() + seconds
         while True:
@@ -154,7 +154,7 @@ def open_page(folder: Path, size: tuple[int, int] = (900, 600)) -> Iterator[Page
                 process.wait()
 
 
-def _devtools_port(file: Path, process: subprocess.Popen[bytes], seconds: float = 60.0) -> int:
+def _devtools_port(file: Path, process: subprocess.Popen[bytes], seconds: float = 90.0) -> int:
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         if process.poll() is not None:

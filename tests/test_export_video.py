@@ -20,7 +20,7 @@ from gridreg.export.model import Model
 from gridreg.export.pictures import beside, colour_bar, depth_range, picture
 from gridreg.export.video import render_frames, render_video
 from gridreg.export.writers import write_video
-from gridreg.rendering import Rendered
+from gridreg.rendering import Rays, Rendered
 from tests.export_fields import AnalyticField, ball, ring_of_views
 
 RED = torch.tensor([1.0, 0.0, 0.0])
@@ -74,6 +74,16 @@ class TestModel:
         assert torch.equal(whole.depth, parts.depth)
         asked = iter([False, True])
         assert model.render(camera, chunk=600, stop=lambda: next(asked)) is None
+
+    def test_warped_rays_walk_the_field_from_elsewhere(self):
+        plain, camera = model_of(), cameras_of(1)[0]
+
+        def shifted(rays: Rays) -> Rays:
+            return Rays(rays.origins + torch.tensor([0.0, 0.0, 5.0]), rays.directions)
+
+        moved = Model(plain.field, plain.occupancy, plain.march, warp=shifted).render(camera)
+        assert float(moved.opacity.max()) == 0
+        assert float(plain.render(camera).opacity.max()) > 0.99
 
     def test_background(self):
         rendered = model_of(background=torch.tensor([0.0, 1.0, 0.0])).render(cameras_of(1)[0])

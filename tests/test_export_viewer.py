@@ -36,7 +36,7 @@ def taken_port() -> tuple[socket.socket, int]:
 FRONT = look_at(np.array([3.0, 0, 0]), np.zeros(3), np.array([0.0, 0, 1]))
 
 
-def until(condition: Any, seconds: float = 30.0) -> Any:
+def until(condition: Any, seconds: float = 90.0) -> Any:
     end = time.monotonic() + seconds
     while not (value := condition()):
         assert time.monotonic() < end, "not in time"

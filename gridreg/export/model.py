@@ -31,6 +31,9 @@ class Model:
         march: step and range of the rays.
         background: ``(3,)`` colour behind the field.
         handle: of the regularizers attached to the field, if any.
+        warp: maps rays of cameras to the field's coordinates, such as normalised device coordinates
+            (`gridreg.scenes.ndc_rays`) for forward-facing scenes; distances are then those of the mapped
+            rays. None: they are the world's.
     """
 
     field: Any
@@ -38,6 +41,7 @@ class Model:
     march: March
     background: Tensor = field(default_factory=_white)
     handle: Handle | None = None
+    warp: Callable[[Rays], Rays] | None = None
 
     @classmethod
     def of_field(cls, field: Any, *, resolution: int = 256, background: Tensor | None = None) -> Model:
@@ -74,6 +78,7 @@ class Model:
         rays = camera_rays(
             camera.pose.to(device), torch.tensor(lens.intrinsics, device=device), lens.height, lens.width
         )
+        rays = rays if self.warp is None else self.warp(rays)
         parts = []
         for start in range(0, len(rays), chunk):
             if stop is not None and stop():

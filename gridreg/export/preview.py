@@ -54,6 +54,11 @@ class Preview:
         """Names of the regularizers that change what the field looks like, as in the table of the handle."""
         return tuple(self._regularizers)
 
+    @property
+    def warped(self) -> bool:
+        """Whether rays are mapped before they are walked, see `Model`."""
+        return self._model.warp is not None
+
     def at(self, step: int | None = None, off: Collection[str] = ()) -> Model:
         """The model as it would be at a step, with some masks taken off.
 

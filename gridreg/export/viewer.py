@@ -233,9 +233,9 @@ class Viewer:
             return
         self._pace.saw(camera.lens.height * camera.lens.width, time.monotonic() - start)
         pixels, note = _composed(rendered, look)
-        screen.client.scene.set_background_image(
-            pixels, format="jpeg", jpeg_quality=90, depth=z_depth(rendered, camera.lens.intrinsics)
-        )
+        # Where rays are warped, distances are not the world's, and no camera can be hidden by them.
+        depth = None if self._preview.warped else z_depth(rendered, camera.lens.intrinsics)
+        screen.client.scene.set_background_image(pixels, format="jpeg", jpeg_quality=90, depth=depth)
         screen.drawn, screen.width, screen.sharp = wanted, width, width >= shape[1]
         seconds = time.monotonic() - start
         step = f"step {self._preview.step}, " if self._preview.total_steps else ""
