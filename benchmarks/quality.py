@@ -29,7 +29,15 @@ def result_path(scene: str, run: str, seed: int, steps: int | None, protocol: st
     return RESULTS / f"{scene}-{protocol}-{run.replace(':', '+')}{length}-seed{seed}.json"
 
 
-def score(folder: Path, run: str, seed: int, steps: int | None, protocol: str, backend: str) -> None:
+def score(
+    folder: Path,
+    run: str,
+    seed: int,
+    steps: int | None,
+    protocol: str,
+    backend: str,
+    changes: tuple[str, ...],
+) -> None:
     target = result_path(folder.name, run if backend == "auto" else f"{run}-{backend}", seed, steps, protocol)
     if target.exists():
         return
@@ -41,6 +49,7 @@ def score(folder: Path, run: str, seed: int, steps: int | None, protocol: str, b
         composition=composition or None,
         seed=seed,
         steps=steps,
+        set=changes,
     )
     config = configure(options)
     scene = open_scene(config, cache=Path(tempfile.gettempdir()))
