@@ -68,6 +68,7 @@ def score(
         run,
         "--seeds",
         str(seed),
+        *(["--set", *changes] if changes else []),
     ]
     write_json(target, metrics)
     print(row(metrics), flush=True)
@@ -100,6 +101,8 @@ def main() -> int:
     parser.add_argument("--runs", nargs="+", default=["quick"])
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--steps", type=int)
+    parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="such as field.decoder=mlp")
+    parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="such as field.decoder=mlp")
     parser.add_argument("--protocol", default="dietnerf8")
     parser.add_argument("--threads", type=int)
     parser.add_argument("--backend", choices=("auto", "torch"), default="auto")
@@ -119,9 +122,9 @@ def main() -> int:
     for seed in arguments.seeds:
         for scene in arguments.scenes:
             for run in arguments.runs:
-                score(
-                    arguments.data / scene, run, seed, arguments.steps, arguments.protocol, arguments.backend
-                )
+                folder = arguments.data / scene
+                changes = tuple(arguments.set)
+                score(folder, run, seed, arguments.steps, arguments.protocol, arguments.backend, changes)
     return 0
 
 
