@@ -102,7 +102,6 @@ def main() -> int:
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--steps", type=int)
     parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="such as field.decoder=mlp")
-    parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="such as field.decoder=mlp")
     parser.add_argument("--protocol", default="dietnerf8")
     parser.add_argument("--threads", type=int)
     parser.add_argument("--backend", choices=("auto", "torch"), default="auto")
