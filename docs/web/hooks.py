@@ -15,6 +15,13 @@ _FOREIGN = re.compile(
 )
 
 
+def on_config(config: Any) -> Any:
+    """The settings, with the page of results in the menu once a benchmark has written it."""
+    if (Path(config["docs_dir"]) / "results.md").is_file():
+        config["nav"].insert(-1, {"Results": "results.md"})
+    return config
+
+
 def on_page_content(text: str, config: Any, **_: Any) -> str:
     """A page's HTML with its pictures inside, so that they follow the page's colours."""
     return inlined(text, Path(config["docs_dir"]))

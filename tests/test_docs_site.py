@@ -1,0 +1,172 @@
+"""The site around the pages: pictures drawn by the code, what happens to them, and readable docstrings."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+from xml.etree import ElementTree
+
+import pytest
+
+DOCS = Path(__file__).parent.parent / "docs"
+
+
+@pytest.fixture
+def make_pictures(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
+    """The script that draws them."""
+    monkeypatch.syspath_prepend(DOCS)
+    yield importlib.import_module("make_pictures")
+    for name in [name for name in sys.modules if name == "make_pictures" or name.split(".")[0] == "drawing"]:
+        del sys.modules[name]
+
+
+def test_pictures_are_up_to_date(make_pictures: ModuleType, capsys: pytest.CaptureFixture[str]) -> None:
+    status = make_pictures.main(["--check"])
+    assert status == 0, capsys.readouterr().out
+
+
+def test_stale_pictures_are_noticed_and_written_anew(
+    make_pictures: ModuleType,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    line = '<svg><path d="M10 20.5L{} 7"/></svg>'
+    monkeypatch.setattr(make_pictures, "pictures", lambda: {"a": line.format(30), "b": line.format(40)})
+    assert make_pictures.main([], tmp_path) == 0
+    assert make_pictures.main(["--check"], tmp_path) == 0
+    # Rounding is forgiven, a different value, a missing or a left-over file is not.
+    (tmp_path / "a.svg").write_text(line.format(30.1))
+    assert make_pictures.main(["--check"], tmp_path) == 0
+    (tmp_path / "a.svg").write_text(line.format(31))
+    (tmp_path / "b.svg").unlink()
+    (tmp_path / "c.svg").write_text(line.format(1))
+    assert make_pictures.main(["--check"], tmp_path) == 1
+    assert "stale: a.svg, b.svg, c.svg;" in capsys.readouterr().out
+    assert make_pictures.main([], tmp_path) == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.svg", "b.svg"]
+    assert make_pictures.main(["--check"], tmp_path) == 0
+
+
+def test_pictures_are_small_and_whole() -> None:
+    files = sorted((DOCS / "pictures").glob("*"))
+    assert {path.suffix for path in files} == {".svg"}
+    assert sum(path.stat().st_size for path in files) < 200_000
+    for path in files:
+        root = ElementTree.parse(path).getroot()
+        width, height = (float(root.attrib[name]) for name in ("width", "height"))
+        assert root.attrib["viewBox"] == f"0 0 {width:g} {height:g}"
+        for text in root.iter("{http://www.w3.org/2000/svg}text"):
+            assert 0 <= float(text.attrib["x"]) <= width
+            assert 0 <= float(text.attrib["y"]) <= height
+
+
+def test_pages_show_every_picture_with_a_description() -> None:
+    shown = set()
+    for path in {*DOCS.rglob("*.md")} - {DOCS / "results.md"}:
+        for text, target in re.findall(r"!\[(.*?)\]\((.*?)\)", path.read_text(encoding="utf-8")):
+            assert len(text.split()) >= 5, f"{path.name}: {target} needs a description"
+            shown.add((path.parent / target).resolve())
+    assert shown == set((DOCS / "pictures").resolve().glob("*.svg"))
+
+
+# --- the site's own code
+
+
+def module_at(path: Path) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_results_enter_the_menu_once_they_are_there(tmp_path: Path) -> None:
+    hooks = module_at(DOCS / "web" / "hooks.py")
+    config = {"docs_dir": str(tmp_path), "nav": [{"Start": "index.md"}, {"Reference": "api.md"}]}
+    assert [list(entry) for entry in hooks.on_config(dict(config))["nav"]] == [["Start"], ["Reference"]]
+    (tmp_path / "results.md").write_text("# Results\n")
+    assert [list(entry) for entry in hooks.on_config(config)["nav"]] == [
+        ["Start"],
+        ["Results"],
+        ["Reference"],
+    ]
+
+
+def test_pictures_go_inline(tmp_path: Path) -> None:
+    hooks = module_at(DOCS / "web" / "hooks.py")
+    (tmp_path / "pictures").mkdir()
+    drawn = (
+        '<svg xmlns="http://www.w3.org/2000/svg" class="gr"><style>.gr { color: red }</style><path/></svg>\n'
+    )
+    (tmp_path / "pictures" / "a.svg").write_text(drawn)
+    page = '<p><img alt="a &lt; b" src="../pictures/a.svg" /> <img alt="" src="other.png" /></p>'
+    inlined = hooks.on_page_content(page, {"docs_dir": str(tmp_path)}, page=None, files=None)
+    assert inlined == (
+        '<p><svg role="img" aria-label="a &lt; b" class="gr"><path/></svg> <img alt="" src="other.png" /></p>'
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "count"),
+    [
+        ('<a href="https://example.org">a link is not fetched</a>', 0),
+        ('<script src="assets/a.js"></script><link rel="stylesheet" href="a.css">', 0),
+        ('<script defer src="https://example.org/a.js"></script>', 1),
+        ('<link rel="preconnect" href="//example.org">', 1),
+        ('<img alt="" src="http://example.org/a.png">', 1),
+        ("@import 'https://example.org/a.css'; a { background: url(https://example.org/a.png) }", 2),
+        ("a { background: url(data:image/svg+xml;charset=utf-8,<svg/>) }", 0),
+    ],
+)
+def test_fetches_from_elsewhere_are_found(text: str, count: int) -> None:
+    assert len(module_at(DOCS / "web" / "hooks.py").foreign(text)) == count
+
+
+def test_docstrings_are_made_readable() -> None:
+    pytest.importorskip("griffe", reason="griffe, of the docs extra, is not installed")
+    readable = module_at(DOCS / "web" / "docstrings.py").readable
+    text = """What :func:`~gridreg.apply` does.
+
+Args:
+    near, far: of the ray,
+    world units.
+    *rest: others.
+
+Formula: ``a``
+Unit: none
+
+Example:
+    >>> 1
+    1
+
+>>> 2
+2"""
+    assert (
+        readable(text)
+        == """What `gridreg.apply` does.
+
+Args:
+    near: of the ray,
+        world units.
+    far: of the ray,
+        world units.
+    *rest: others.
+
+* **Formula** ``a``
+* **Unit** none
+
+Examples:
+    >>> 1
+    1
+
+Examples:
+    >>> 2
+    2"""
+    )
