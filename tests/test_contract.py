@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
@@ -158,6 +158,7 @@ def test_the_suite_catches_what_breaks_a_law(registered: Any) -> None:
 
 
 @pytest.mark.parametrize("name", DESIGNS)
+@settings(max_examples=15)
 @given(data=st.data())
 def test_two_masks_on_one_site_multiply(name: str, data: st.DataObject) -> None:
     site = data.draw(st.sampled_from(DESIGNS[name].mask_sites))
