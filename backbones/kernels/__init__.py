@@ -4,19 +4,32 @@ from __future__ import annotations
 
 from backbones.kernels import composite
 from backbones.kernels.autograd import accumulate_into_grad
-from backbones.kernels.dispatch import cp_density, cp_features, vm_density, vm_features
+from backbones.kernels.dispatch import (
+    Activation,
+    March,
+    cp_density,
+    cp_features,
+    cp_march_density,
+    vm_density,
+    vm_features,
+    vm_march_density,
+)
 from backbones.kernels.encode import encode, encode_together
 from backbones.kernels.linear import mlp
 
 __all__ = [
+    "Activation",
+    "March",
     "accumulate_into_grad",
     "cp_density",
     "cp_features",
+    "cp_march_density",
     "encode",
     "encode_together",
     "mlp",
     "vm_density",
     "vm_features",
+    "vm_march_density",
 ]
 
 composite.register()

@@ -11,9 +11,12 @@ import torch
 from torch import Tensor
 
 from backbones.kernels import cp, vm, vm_gradient
+from backbones.kernels.activation import Activation, March
+from backbones.kernels.march import march as _march
 from backbones.kernels.simd import LANES
+from backbones.kernels.walk import walk
 
-__all__ = ["accumulate_into_grad", "cp_density", "cp_features", "vm_density", "vm_features"]
+__all__ = ["accumulate_into_grad", "cp_density", "cp_features", "march_density", "vm_density", "vm_features"]
 
 _local = threading.local()
 
@@ -78,21 +81,83 @@ class _Lookup(torch.autograd.Function):
     @torch.autograd.function.once_differentiable  # type: ignore[untyped-decorator]
     def backward(ctx: Any, upstream: Tensor) -> tuple[Any, ...]:
         u, *grids = ctx.saved_tensors
-        buffers, returned = _gradient_buffers(grids[:-3], getattr(_local, "in_place", False))
-        lines = ctx.backward_pass(
-            u.detach().contiguous(),
-            *_parts(grids),
-            ctx.read,
-            upstream.contiguous(),
-            *([buffers] if buffers else []),
-        )
-        return (None, None, None, None, *returned, *lines)
+        return (None, None, None, None, *_gradients(ctx, u, grids, upstream))
+
+
+def _gradients(ctx: Any, u: Tensor, grids: Sequence[Tensor], upstream: Tensor) -> list[Tensor | None]:
+    """What a backward pass returns for the grids."""
+    buffers, returned = _gradient_buffers(grids[:-3], getattr(_local, "in_place", False))
+    given = [buffers] if buffers else []
+    lines = ctx.backward_pass(
+        u.detach().contiguous(), *_parts(grids), ctx.read, upstream.contiguous(), *given
+    )
+    return [*returned, *lines]
 
 
 def _parts(grids: Sequence[Tensor]) -> list[list[Tensor]]:
     """Planes, if there are any, and lines, as kernels want them."""
     contiguous = [grid.detach().contiguous() for grid in grids]
     return [contiguous[:-3], contiguous[-3:]] if len(grids) > 3 else [contiguous]
+
+
+def _opened(lines: Sequence[Tensor], open_channels: int) -> tuple[Sequence[Tensor], int]:
+    """Lines without closed channels, and how many channels to read."""
+    channels = lines[0].shape[1]
+    if open_channels >= channels:
+        return lines, channels
+    # Whole vectors are read: closed channels among them must count as 0, and their gradient stops here.
+    lines = [torch.cat([x[:, :open_channels], torch.zeros_like(x[:, open_channels:])], 1) for x in lines]
+    return lines, min(channels, -(-open_channels // LANES) * LANES)
+
+
+class _Activated(torch.autograd.Function):
+    """Densities that are known already, as a function of the grids that they came from."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        backward: Callable[..., Any],
+        density: Tensor,
+        u: Tensor,
+        scale: float,
+        read: int,
+        *grids: Tensor,
+    ) -> Tensor:
+        ctx.backward_pass, ctx.scale, ctx.read = backward, scale, read
+        ctx.save_for_backward(density, u, *grids)
+        return density.clone()
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable  # type: ignore[untyped-decorator]
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Any, ...]:
+        density, u, *grids = ctx.saved_tensors
+        # The derivative of softplus is 1 - exp(-softplus), and 0 where the density is 0: outside the box.
+        upstream = upstream * torch.expm1(density / -ctx.scale).mul_(-ctx.scale)
+        return (None, None, None, None, None, *_gradients(ctx, u, grids, upstream))
+
+
+def march_density(
+    march: March,
+    activation: Activation,
+    transmittance_bound: float,
+    planes: Sequence[Tensor],
+    lines: Sequence[Tensor],
+    open_channels: int,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """See `backbones.kernels.vm_march_density`; without planes, a CP grid."""
+    lines, read = _opened(lines, open_channels)
+    grids = (*planes, *lines)
+    found = walk(
+        _march(*march),
+        *_parts(grids),
+        read=read,
+        activation=activation,
+        step=march.step,
+        transmittance_bound=transmittance_bound,
+    )
+    backward = vm_gradient.density_backward if planes else cp.density_backward
+    density: Tensor = _Activated.apply(backward, found.density, found.u, activation.scale, read, *grids)  # type: ignore[no-untyped-call]
+    return found.offsets, found.index, found.t, found.positions, density
 
 
 def _lookup(
@@ -103,12 +168,7 @@ def _lookup(
     lines: Sequence[Tensor],
     open_channels: int,
 ) -> Tensor:
-    channels = lines[0].shape[1]
-    read = channels
-    if open_channels < channels:
-        # Whole vectors are read: closed channels among them must count as 0, and their gradient stops here.
-        read = min(channels, -(-open_channels // LANES) * LANES)
-        lines = [torch.cat([x[:, :open_channels], torch.zeros_like(x[:, open_channels:])], 1) for x in lines]
+    lines, read = _opened(lines, open_channels)
     out: Tensor = _Lookup.apply(forward, backward, u, read, *planes, *lines)  # type: ignore[no-untyped-call]
     return out
 

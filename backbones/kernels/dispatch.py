@@ -8,10 +8,21 @@ import torch
 from torch import Tensor
 
 from backbones.kernels import autograd, reference
+from backbones.kernels.activation import Activation, March
 from gridreg.errors import InputError
+from gridreg.rendering import plain
 from gridreg.rendering.backends import chosen_backend
 
-__all__ = ["cp_density", "cp_features", "vm_density", "vm_features"]
+__all__ = [
+    "Activation",
+    "March",
+    "cp_density",
+    "cp_features",
+    "cp_march_density",
+    "vm_density",
+    "vm_features",
+    "vm_march_density",
+]
 
 
 def _check(u: Tensor, planes: Sequence[Tensor], lines: Sequence[Tensor], open_channels: int | None) -> None:
@@ -99,3 +110,83 @@ def cp_features(u: Tensor, lines: Sequence[Tensor], open_channels: int | None = 
     if _takes_compiled(u, *lines):
         return autograd.cp_features(u, lines, _count(lines, open_channels))
     return reference.cp_features(u, lines, open_channels)
+
+
+def _check_march(march: March, activation: Activation, transmittance_bound: float) -> None:
+    plain.check_march(*march)
+    if tuple(activation.bounds.shape) != (2, 3):
+        raise InputError(f"activation.bounds: found shape {tuple(activation.bounds.shape)}, expected (2, 3)")
+    if not activation.scale > 0:
+        raise InputError(f"activation.scale: found {activation.scale}, expected a positive number")
+    if not 0 <= transmittance_bound <= 1:
+        raise InputError(f"transmittance_bound: found {transmittance_bound}, expected a number in [0, 1]")
+
+
+def vm_march_density(
+    march: March,
+    activation: Activation,
+    transmittance_bound: float,
+    planes: Sequence[Tensor],
+    lines: Sequence[Tensor],
+    open_channels: int | None = None,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """March through an occupancy grid, evaluate the density, and leave a ray where nothing behind can be seen.
+
+    The same as `gridreg.rendering.backends.march`, the density of a field at each sample, and
+    `gridreg.rendering.backends.terminate`; compiled, samples that are dropped are hardly ever computed.
+
+    Args:
+        march: rays, step and cells, and the box that the cells divide.
+        activation: from features to densities, and the field's box, to which positions are normalised.
+        transmittance_bound: samples behind a smaller transmittance are dropped; 0 keeps all.
+        planes, lines, open_channels: as for `vm_density`.
+
+    Returns:
+        ``offsets (R + 1,)`` int64, ``index (N,)`` int64, ``t (N,)``, ``positions (N, 3)`` and ``density (N,)`` of the
+        samples kept; the last is differentiable in planes and lines.
+
+    Raises:
+        InputError: if shapes do not fit or a number is out of range.
+    """
+    _check(march.origins, planes, lines, open_channels)
+    _check_march(march, activation, transmittance_bound)
+    if _takes_compiled(*_tensors(march, activation), *planes, *lines):
+        opened = _count(lines, open_channels)
+        return autograd.march_density(march, activation, transmittance_bound, planes, lines, opened)
+    return reference.march_density(
+        march,
+        activation,
+        transmittance_bound,
+        lambda u: reference.vm_density(u, planes, lines, open_channels),
+    )
+
+
+def cp_march_density(
+    march: March,
+    activation: Activation,
+    transmittance_bound: float,
+    lines: Sequence[Tensor],
+    open_channels: int | None = None,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """`vm_march_density` for the lines of a CP grid."""
+    _check(march.origins, (), lines, open_channels)
+    _check_march(march, activation, transmittance_bound)
+    if _takes_compiled(*_tensors(march, activation), *lines):
+        opened = _count(lines, open_channels)
+        return autograd.march_density(march, activation, transmittance_bound, (), lines, opened)
+    return reference.march_density(
+        march, activation, transmittance_bound, lambda u: reference.cp_density(u, lines, open_channels)
+    )
+
+
+def _tensors(march: March, activation: Activation) -> list[Tensor]:
+    jitter = [march.jitter] if isinstance(march.jitter, Tensor) else []
+    return [
+        march.origins,
+        march.directions,
+        march.t_min,
+        march.t_max,
+        march.bounds,
+        activation.bounds,
+        *jitter,
+    ]

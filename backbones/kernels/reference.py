@@ -5,13 +5,24 @@ The compiled kernels are tested against these functions; `backbones.kernels` doc
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-__all__ = ["LINE_AXES", "PLANE_AXES", "cp_density", "cp_features", "vm_density", "vm_features"]
+from backbones.kernels.activation import Activation, March
+from gridreg.rendering import plain
+
+__all__ = [
+    "LINE_AXES",
+    "PLANE_AXES",
+    "cp_density",
+    "cp_features",
+    "march_density",
+    "vm_density",
+    "vm_features",
+]
 
 PLANE_AXES = ((0, 1), (0, 2), (1, 2))
 LINE_AXES = (2, 1, 0)
@@ -87,3 +98,20 @@ def cp_features(u: Tensor, lines: Sequence[Tensor], open_channels: int | None = 
 def cp_density(u: Tensor, lines: Sequence[Tensor], open_channels: int | None = None) -> Tensor:
     """See `backbones.kernels.cp_density`."""
     return cp_features(u, lines, open_channels).sum(1)
+
+
+def march_density(
+    march: March, activation: Activation, transmittance_bound: float, features: Callable[[Tensor], Tensor]
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """See `backbones.kernels.vm_march_density`; ``features`` maps normalised positions to density features."""
+    offsets, index, t, positions = plain.march(*march)
+    lower, upper = activation.bounds
+    u = (positions - lower) / (upper - lower)
+    inside = ((u >= 0) & (u <= 1)).all(dim=1)
+    density = activation.scale * F.softplus(features(u) + activation.shift)
+    density = torch.where(inside, density, torch.zeros_like(density))
+    if transmittance_bound > 0:
+        seen = plain.terminate(density.detach() * march.step, offsets, transmittance_bound)
+        offsets = F.pad(seen.cumsum(0), (1, 0))[offsets]
+        index, t, positions, density = index[seen], t[seen], positions[seen], density[seen]
+    return offsets, index, t, positions, density

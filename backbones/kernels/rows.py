@@ -31,10 +31,12 @@ from backbones.kernels.simd import load, one
 from backbones.kernels.threading import launch
 from backbones.kernels.workspace import room
 
-__all__ = ["ENTRY", "TASKS", "Listing", "list_by_row", "span"]
+__all__ = ["ALONE", "ENTRY", "TASKS", "Listing", "list_by_row", "span"]
 
 # Tasks for each axis or plane: more than threads, so that an unlucky thread does not hold the others up.
 TASKS = 16
+# Fewer samples than this are not worth a second thread.
+ALONE = 1024
 # Elements of an entry of a listing: one for each axis and one more.
 ENTRY = 4
 
@@ -126,7 +128,8 @@ def list_by_row(u: Tensor, upstream: Tensor, shape: tuple[int, int, int], sorts:
         room("shares", sorts, samples, ENTRY),
     )
     rows = room("rows", sorts, samples, dtype=torch.int32)
-    launch(_sort, sorts, u, upstream, int(upstream.dim() == 1), torch.tensor(shape), *listing, rows)
+    summed = int(upstream.dim() == 1)
+    launch(_sort, sorts, u, upstream, summed, torch.tensor(shape), *listing, rows, alone=samples < ALONE)
     return listing
 
 

@@ -88,7 +88,7 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_after_fork)
 
 
-def launch(kernel: Kernel, tasks: int, *arguments: Tensor | int | float) -> None:
+def launch(kernel: Kernel, tasks: int, *arguments: Tensor | int | float, alone: bool = False) -> None:
     """Run ``kernel`` until all of ``tasks`` are done.
 
     Args:
@@ -96,6 +96,7 @@ def launch(kernel: Kernel, tasks: int, *arguments: Tensor | int | float) -> None
         tasks: how many; they start in order and run at the same time.
         arguments: contiguous CPU tensors of at most 3 axes, and numbers; the kernel reads them by position
             (`backbones.kernels.compiler`). The kernel writes into tensors in place.
+        alone: stay on this thread, as there is less to do than it takes to wake others.
 
     Raises:
         ValueError: for a tensor that is not contiguous or not on the CPU.
@@ -106,7 +107,7 @@ def launch(kernel: Kernel, tasks: int, *arguments: Tensor | int | float) -> None
     address = ctypes.addressof(table)
     # Always the whole team: a smaller one would make the runtime end threads, and start them again later.
     threads = torch.get_num_threads()
-    if threads == 1 or tasks == 1 or _state["forked"]:
+    if alone or threads == 1 or tasks == 1 or _state["forked"]:
         _NATIVE(kernel.address)(address)
         return
     runtime()

@@ -22,7 +22,7 @@ from backbones.kernels.compiler import (
 )
 from backbones.kernels.lookup import ahead, bilinear, corners, linear, prefetch_cell, prefetch_row
 from backbones.kernels.places import axes
-from backbones.kernels.rows import ENTRY, TASKS, list_by_row, span
+from backbones.kernels.rows import ALONE, ENTRY, TASKS, list_by_row, span
 from backbones.kernels.simd import LANES, load, one, store, wide
 from backbones.kernels.threading import launch
 from backbones.kernels.workspace import room
@@ -161,7 +161,20 @@ def _run(
     listing = list_by_row(u, upstream, (nodes[2], nodes[1], nodes[0]), 2)
     copies = room("copies", TASKS, sum(nodes), lines[0].shape[1])
     waste = room("waste", 3 * TASKS, 2, lines[0].shape[1]).zero_()
-    launch(compiled, 3 * TASKS, u, *planes, *lines, read, upstream, *plane_gradients, copies, *listing, waste)
+    launch(
+        compiled,
+        3 * TASKS,
+        u,
+        *planes,
+        *lines,
+        read,
+        upstream,
+        *plane_gradients,
+        copies,
+        *listing,
+        waste,
+        alone=u.shape[0] < ALONE,
+    )
     return list(torch.split(copies.sum(0), nodes))
 
 

@@ -8,11 +8,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from backbones.kernels.activation import Activation
 from backbones.kernels.compiler import (
     exact,
     float32,
@@ -34,20 +35,14 @@ from backbones.kernels.softplus import softplus
 from backbones.kernels.threading import launch
 from backbones.kernels.vm import find_cells, look_up
 
-__all__ = ["Activation", "Walked", "walk"]
+__all__ = ["Walked", "walk"]
 
 # Samples between two looks at the transmittance: so many may be computed in vain behind the last one.
 _GROUP = LANES
+# Samples placed on the grid at a time, of which most may be in vain.
+_SPAN = 64
 # Rays of a task.
 _RAYS = 16
-
-
-class Activation(NamedTuple):
-    """``density = scale * softplus(feature + shift)`` inside a box ``bounds (2, 3)``, 0 outside."""
-
-    scale: float
-    shift: float
-    bounds: Tensor
 
 
 @dataclass(frozen=True)
@@ -122,8 +117,8 @@ def _walk_ray(table: Any, begin: Any, end: Any, places: Any, cells: Any, feature
     channels = size(table, 8, 1)
     shape = size(table, 10, 0), size(table, 9, 0), size(table, 8, 0)
     depth = float32(0)
-    for first in range(begin, end, BATCH):
-        count = min(int64(BATCH), end - first)
+    for first in range(begin, end, _SPAN):
+        count = min(int64(_SPAN), end - first)
         _normalise(x, box, first, first + count, u)
         find(places, u, first, count, shape)
         if planar:
@@ -209,8 +204,7 @@ def _pack(table: Any) -> None:
 
 def walk(
     marched: tuple[Tensor, Tensor, Tensor, Tensor],
-    planes: Sequence[Tensor],
-    lines: Sequence[Tensor],
+    *grids: Sequence[Tensor],
     read: int,
     activation: Activation,
     step: float,
@@ -220,23 +214,23 @@ def walk(
 
     Args:
         marched: offsets, index, t and positions, as `backbones.kernels.march.march` returns them.
-        planes: three, or none for a CP grid.
-        lines: three.
+        grids: three planes, unless the grid is a CP grid, and three lines.
         read: number of channels to use.
         activation: from features to densities.
         step: length of a sample's interval, world units.
         transmittance_bound: samples behind a smaller transmittance are dropped.
     """
+    planar, lines = len(grids) > 1, grids[-1]
     offsets, index, t, positions = marched
     rays, samples = offsets.shape[0] - 1, positions.shape[0]
     tasks = -(-rays // _RAYS)
     u, density = torch.empty(samples, 3), torch.empty(samples)
     counts = torch.empty(rays, dtype=torch.int64)
     limit = -math.log(transmittance_bound) if transmittance_bound > 0 else math.inf
-    grids = (*(planes or lines), *lines)
+    # A CP grid gives its lines once more in place of planes, which are not read then.
     launch(
-        _vm_walk if planes else _cp_walk, tasks, positions, offsets, activation.bounds.contiguous(), u, density, *grids,
-        read, float(activation.shift), float(activation.scale), float(step), limit, counts,
+        _vm_walk if planar else _cp_walk, tasks, positions, offsets, activation.bounds.contiguous(), u, density,
+        *grids[0], *lines, read, float(activation.shift), float(activation.scale), float(step), limit, counts,
     )  # fmt: skip
     seen = torch.zeros_like(offsets)
     torch.cumsum(counts, 0, out=seen[1:])
