@@ -131,7 +131,14 @@ def test_a_prepared_scene_states_its_extent(scene: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "stated", [7, {}, {"near": 1, "far": 2}, {"near": "a", "far": 2, "bounds": [[0] * 3] * 2}]
+    "stated",
+    [
+        7,
+        {},
+        {"near": 1, "far": 2},
+        {"near": "a", "far": 2, "bounds": [[0] * 3] * 2},
+        {"near": 1, "far": 2, "bounds": [1]},
+    ],
 )
 def test_a_damaged_extent(scene: Path, stated: object) -> None:
     edit(scene, lambda c: c.update(gridreg=stated))
