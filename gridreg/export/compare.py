@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.spatial import KDTree  # type: ignore[import-untyped]
-from trimesh.triangles import closest_point
 
 from gridreg.errors import InputError
 from gridreg.export.marching import face_areas
@@ -110,6 +109,21 @@ def _unit_normals(mesh: Mesh) -> Points:
     return np.asarray(normals / np.maximum(length, np.finfo(np.float64).tiny))
 
 
+def _to_triangles(points: Points, triangles: Points) -> Points:
+    """Distance ``(N,)`` of each point ``(N, 3)`` to its own triangle ``(N, 3, 3)``, at any scale."""
+    tiny = np.finfo(np.float64).tiny
+    following = np.roll(triangles, -1, axis=1)
+    edges, away = following - triangles, points[:, None] - triangles
+    share = (away * edges).sum(axis=-1) / np.maximum((edges * edges).sum(axis=-1), tiny)
+    to_edges = np.linalg.norm(away - np.clip(share, 0, 1)[..., None] * edges, axis=-1).min(axis=1)
+    normal = np.cross(edges[:, 0], edges[:, 1])
+    length = np.linalg.norm(normal, axis=-1)
+    above = (np.cross(edges, away) * normal[:, None]).sum(axis=-1) >= 0
+    to_plane = np.abs((away[:, 0] * normal).sum(axis=-1)) / np.maximum(length, tiny)
+    found: Points = np.where(above.all(axis=1) & (length > 0), to_plane, to_edges)
+    return found
+
+
 def _nearest(
     points: Points, mesh: Mesh, samples: Points, faces: NDArray[np.int64]
 ) -> tuple[Points, NDArray[np.int64]]:
@@ -125,9 +139,7 @@ def _nearest(
     best = np.full(len(points), np.inf)
     face = np.zeros(len(points), np.int64)
     for candidate in faces[near].T:
-        triangles = mesh.vertices[mesh.faces[candidate]]
-        nearest = closest_point(triangles, points)  # type: ignore[no-untyped-call]
-        distance = np.linalg.norm(nearest - points, axis=1)
+        distance = _to_triangles(points, mesh.vertices[mesh.faces[candidate]])
         closer = distance < best
         best, face = np.where(closer, distance, best), np.where(closer, candidate, face)
     return best, face
