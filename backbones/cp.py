@@ -11,6 +11,7 @@ from torch.nn import functional as F
 from backbones import kernels
 from backbones.tensorial import TensorialField
 from gridreg.attach import open_channels
+from gridreg.rendering import Marched, OccupancyGrid, Rays
 from gridreg.sites import Site, parameters
 
 __all__ = ["LINE_AXES", "CPField"]
@@ -60,6 +61,37 @@ class CPField(TensorialField):
     def appearance_features(self, u: Tensor) -> Tensor:
         """Normalised positions ``(N, 3)`` to the products of the components ``(N, C)``."""
         return kernels.cp_features(u, list(self.appearance_lines), open_channels(self.appearance_lines, "0"))
+
+    def march_density(
+        self,
+        rays: Rays,
+        t_min: Tensor,
+        t_max: Tensor,
+        step: float,
+        occupancy: OccupancyGrid,
+        jitter: Tensor,
+        transmittance_bound: float,
+    ) -> Marched:
+        """March, density and early termination in one: see `gridreg.rendering.March` and `Marched`.
+
+        Args:
+            rays: ``R`` rays.
+            t_min, t_max: ``(R,)``, where they enter and leave the box, world units.
+            step: between samples, world units.
+            occupancy: cells that may hold something.
+            jitter: ``(R,)`` in [0, 1).
+            transmittance_bound: samples behind this transmittance are dropped.
+        """
+        march = kernels.March(
+            rays.origins, rays.directions, t_min, t_max, step, occupancy.cells, occupancy.bounds, jitter
+        )
+        activation = kernels.Activation(self.bounds, self.density_shift, self.distance_scale)
+        opened = open_channels(self.density_lines, "0")
+        return Marched(
+            *kernels.cp_march_density(
+                march, activation, transmittance_bound, list(self.density_lines), opened
+            )
+        )
 
     @torch.no_grad()
     def resample(self, resolution: tuple[int, int, int]) -> None:

@@ -247,6 +247,48 @@ def test_compiled_and_plain_lookups_agree(visible):
         torch.testing.assert_close(compiled, plain, atol=2e-4, rtol=2e-4)
 
 
+class Apart(torch.nn.Module):
+    """A field without a march of its own, so that march, density and termination run one after the other."""
+
+    def __init__(self, field):
+        super().__init__()
+        self.field, self.bounds = field, field.bounds
+
+    def density(self, x):
+        return self.field.density(x)
+
+    def colour(self, x, d):
+        return self.field.colour(x, d)
+
+
+@pytest.mark.parametrize("backend", ["torch", "auto"])
+@given(seed=st.integers(0, 20), bound=st.sampled_from([0.0, 1e-3]), visible=st.sampled_from([1.0, 0.5]))
+def test_marching_in_one_call_is_marching_step_by_step(backend, seed, bound, visible):
+    field = small((9, 8, 10), seed, density_components=16, density_shift=-1.0)
+    generator = torch.Generator().manual_seed(seed)
+    aim = BOX[0] + torch.rand(12, 3, generator=generator) * (BOX[1] - BOX[0])
+    directions = torch.nn.functional.normalize(torch.randn(12, 3, generator=generator), dim=-1)
+    rays = Rays(aim - 5 * directions, directions)
+    grid = OccupancyGrid.full(BOX, (6, 6, 6))
+    grid.cells[2] = 0
+    results = []
+    with (
+        use_backend(backend),
+        gridreg.apply(field, gridreg.FixedMask("density", visible_ratio=visible), total_steps=10),
+    ):
+        for one in (field, Apart(field)):
+            field.zero_grad()
+            out = render_rays(
+                one, rays, grid, March(0.07, transmittance_bound=bound), background=torch.ones(3)
+            )
+            out.opacity.square().sum().backward()
+            gradients = [field.density_lines._parameters[str(k)].grad.clone() for k in range(3)]
+            assert len(out.samples) > 0
+            results.append([out.samples.offsets, out.samples.index, out.opacity.detach(), *gradients])
+    for fused, apart in zip(*results, strict=True):
+        torch.testing.assert_close(fused, apart, atol=1e-4, rtol=1e-3)
+
+
 def test_a_few_steps_of_training_bring_a_picture_closer():
     field = small(
         (16, 16, 16), scale=0.2, density_components=24, appearance_components=24, density_shift=None
