@@ -43,10 +43,8 @@ def prefetch_cell(plane: Any, i: Any, channels: Any, down: Any, read: Any) -> An
 @inline
 def corners(a: Any, b: Any) -> Any:
     """Weights of the four nodes around a position in a cell of a plane: (0, 0), (0, 1), (1, 0), (1, 1)."""
-    w11 = a * b
-    w10 = a - w11
-    w01 = b - w11
-    return float32(1) - a - w01, w01, w10, w11
+    rest_a, rest_b = float32(1) - a, float32(1) - b
+    return rest_a * rest_b, rest_a * b, a * rest_b, a * b
 
 
 @inline

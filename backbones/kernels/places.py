@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from backbones.kernels.compiler import float32, inline, int32
+from backbones.kernels.compiler import exact, float32, inline, int32
 from backbones.kernels.simd import load, one
 
 __all__ = ["BATCH", "PLACES", "axes", "batch", "find", "node"]
@@ -27,7 +27,8 @@ def axes(k: Any) -> Any:
     return 1 if k == 2 else 0, 1 if k == 0 else 2, 2 - k
 
 
-@inline
+# Every operation rounded on its own, as in the plain version: on 300 nodes the last bit of a product is 3e-5 of a cell.
+@exact
 def node(u: Any, edge: Any) -> Any:
     """Node below coordinate ``u``, clamped to [0, 1], on ``edge`` nodes, and the share of the node above it.
 
