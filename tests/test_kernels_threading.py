@@ -122,7 +122,7 @@ def test_vector_arithmetic(length):
 
 
 def test_refuses_strided_tensors():
-    with pytest.raises(ValueError, match="argument 0: found cpu tensor .* expected a contiguous"):
+    with pytest.raises(ValueError, match=r"argument 0: found cpu tensor .* expected a contiguous"):
         launch(_count, 1, torch.zeros(4, 4, dtype=torch.int64).t())
 
 
