@@ -11,7 +11,6 @@ from torch.nn import functional as F
 from backbones import kernels
 from backbones.tensorial import TensorialField
 from gridreg.attach import open_channels
-from gridreg.rendering import Marched, OccupancyGrid, Rays
 from gridreg.sites import Site, parameters
 
 __all__ = ["LINE_AXES", "CPField"]
@@ -56,41 +55,18 @@ class CPField(TensorialField):
 
     def density_features(self, u: Tensor) -> Tensor:
         """``G(x)``: normalised positions ``(N, 3)`` to ``(N,)``."""
-        return kernels.cp_density(u, list(self.density_lines), open_channels(self.density_lines, "0"))
+        return kernels.cp_density(u, list(self.density_lines), _open_components(self.density_lines))
 
     def appearance_features(self, u: Tensor) -> Tensor:
         """Normalised positions ``(N, 3)`` to the products of the components ``(N, C)``."""
-        return kernels.cp_features(u, list(self.appearance_lines), open_channels(self.appearance_lines, "0"))
+        return kernels.cp_features(u, list(self.appearance_lines), _open_components(self.appearance_lines))
 
-    def march_density(
-        self,
-        rays: Rays,
-        t_min: Tensor,
-        t_max: Tensor,
-        step: float,
-        occupancy: OccupancyGrid,
-        jitter: Tensor,
-        transmittance_bound: float,
-    ) -> Marched:
-        """March, density and early termination in one: see `gridreg.rendering.March` and `Marched`.
-
-        Args:
-            rays: ``R`` rays.
-            t_min, t_max: ``(R,)``, where they enter and leave the box, world units.
-            step: between samples, world units.
-            occupancy: cells that may hold something.
-            jitter: ``(R,)`` in [0, 1).
-            transmittance_bound: samples behind this transmittance are dropped.
-        """
-        march = kernels.March(
-            rays.origins, rays.directions, t_min, t_max, step, occupancy.cells, occupancy.bounds, jitter
-        )
-        activation = kernels.Activation(self.bounds, self.density_shift, self.distance_scale)
-        opened = open_channels(self.density_lines, "0")
-        return Marched(
-            *kernels.cp_march_density(
-                march, activation, transmittance_bound, list(self.density_lines), opened
-            )
+    def _marched(
+        self, march: kernels.March, activation: kernels.Activation, transmittance_bound: float
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        opened = _open_components(self.density_lines)
+        return kernels.cp_march_density(
+            march, activation, transmittance_bound, list(self.density_lines), opened
         )
 
     @torch.no_grad()
@@ -133,3 +109,9 @@ def _lines(
 def _resampled(line: Tensor, size: int) -> Tensor:
     """Linear interpolation of a line ``(M, C)``, end to end: ``(size, C)``."""
     return F.interpolate(line.T[None], size=size, mode="linear", align_corners=True)[0].T.contiguous()
+
+
+def _open_components(lines: nn.ParameterList) -> int | None:
+    """Components to read: a component whose factor is closed on any axis is 0."""
+    closed = [c for k in range(3) if (c := open_channels(lines, str(k))) is not None]
+    return min(closed) if closed else None

@@ -14,6 +14,7 @@ from torch.nn import functional as F
 from backbones import kernels
 from backbones.decoders import make_decoder
 from backbones.kernels.adam import FusedAdam
+from gridreg.rendering import Marched, OccupancyGrid, Rays
 from gridreg.sites import Site
 
 __all__ = ["TensorialField", "density_shift_for"]
@@ -54,7 +55,7 @@ def _initialise(modules: Iterable[nn.Module], generator: torch.Generator | None)
 class TensorialField(nn.Module):
     """``density = distance_scale * softplus(G(x) + shift)``, ``colour = S(B A(x), d)`` (TensoRF, section 4.1).
 
-    Subclasses own the grids: they give `density_features`, `appearance_features`, `resample` and `_crop`.
+    Subclasses own the grids: they give `density_features`, `appearance_features`, `resample`, `_crop` and `_marched`.
 
     Args:
         bounds: ``(2, 3)``, world units.
@@ -70,6 +71,13 @@ class TensorialField(nn.Module):
     """
 
     bounds: Tensor
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """A subclass with a density of its own is marched through that density, unless it brings its own march."""
+        super().__init_subclass__(**options)
+        own = {"density", "density_features", "activate", "normalise"} & cls.__dict__.keys()
+        if own and not {"march_density", "_marched"} & cls.__dict__.keys():
+            cls.march_density = None  # type: ignore[assignment]
 
     def __init__(
         self,
@@ -125,6 +133,37 @@ class TensorialField(nn.Module):
         inside = ((u >= 0) & (u <= 1)).all(dim=-1)
         density = self.activate(self.density_features(u))
         return torch.where(inside, density, torch.zeros_like(density))
+
+    def march_density(
+        self,
+        rays: Rays,
+        t_min: Tensor,
+        t_max: Tensor,
+        step: float,
+        occupancy: OccupancyGrid,
+        jitter: Tensor,
+        transmittance_bound: float,
+    ) -> Marched:
+        """March, density and early termination in one: see `gridreg.rendering.March` and `Marched`.
+
+        Args:
+            rays: ``R`` rays.
+            t_min, t_max: ``(R,)``, where they enter and leave the box, world units.
+            step: between samples, world units.
+            occupancy: cells that may hold something.
+            jitter: ``(R,)`` in [0, 1).
+            transmittance_bound: samples behind this transmittance are dropped.
+        """
+        march = kernels.March(
+            rays.origins, rays.directions, t_min, t_max, step, occupancy.cells, occupancy.bounds, jitter
+        )
+        activation = kernels.Activation(self.bounds, self.density_shift, self.distance_scale)
+        return Marched(*self._marched(march, activation, transmittance_bound))
+
+    def _marched(
+        self, march: kernels.March, activation: kernels.Activation, transmittance_bound: float
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        raise TypeError(f"{type(self).__name__} must define _marched")
 
     def colour(self, x: Tensor, d: Tensor) -> Tensor:
         """Colour ``(N, 3)`` at world positions ``(N, 3)`` seen along unit directions ``(N, 3)``."""

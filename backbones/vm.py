@@ -54,7 +54,10 @@ class VMField(TensorialField):
     def density_features(self, u: Tensor) -> Tensor:
         """``G(x)``: normalised positions ``(N, 3)`` to ``(N,)``."""
         return kernels.vm_density(
-            u, list(self.density_planes), list(self.density_lines), open_channels(self.density_lines, "0")
+            u,
+            list(self.density_planes),
+            list(self.density_lines),
+            _open_components(self.density_planes, self.density_lines),
         )
 
     def appearance_features(self, u: Tensor) -> Tensor:
@@ -63,7 +66,20 @@ class VMField(TensorialField):
             u,
             list(self.appearance_planes),
             list(self.appearance_lines),
-            open_channels(self.appearance_lines, "0"),
+            _open_components(self.appearance_planes, self.appearance_lines),
+        )
+
+    def _marched(
+        self, march: kernels.March, activation: kernels.Activation, transmittance_bound: float
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        opened = _open_components(self.density_planes, self.density_lines)
+        return kernels.vm_march_density(
+            march,
+            activation,
+            transmittance_bound,
+            list(self.density_planes),
+            list(self.density_lines),
+            opened,
         )
 
     @torch.no_grad()
@@ -98,6 +114,17 @@ class VMField(TensorialField):
             found[f"{kind}.planes"] = Site(mask=planes, grids=(planes,))
             found[f"{kind}.lines"] = Site(mask=lines, grids=(lines,))
         return found
+
+
+def _open_components(planes: nn.ParameterList, lines: nn.ParameterList) -> int | None:
+    """Components to read: at and beyond this index a mask has closed a factor of all three products."""
+    products = []
+    for k in map(str, range(3)):
+        closed = [c for grids in (planes, lines) if (c := open_channels(grids, k)) is not None]
+        if not closed:
+            return None
+        products.append(min(closed))
+    return max(products)
 
 
 def _grids(
