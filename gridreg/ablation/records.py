@@ -1,0 +1,191 @@
+"""What determines a run, what came of it, and the study that asks for it: plain records."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+from gridreg.errors import InputError
+
+__all__ = ["NUMERICS_VERSION", "STATUSES", "RunResult", "RunSpec", "Status", "Study"]
+
+NUMERICS_VERSION = 1
+"""Raised by one whenever the same configuration gives other numbers, so that stored results are not mixed."""
+
+Status = Literal["waiting", "running", "done", "failed"]
+STATUSES: tuple[Status, ...] = ("waiting", "running", "done", "failed")
+
+_BUILTIN = "builtin"
+
+
+@dataclass(frozen=True)
+class RunSpec:
+    """What determines a run, and the name of the row it stands in.
+
+    Args:
+        label: name of the row in tables, such as ``few_tensorf`` or ``quick - TotalVariation``; two rows may ask for
+            the same run.
+        scene: the scene's folder; None for the built-in scene.
+        protocol: which views are trained on and scored.
+        views: number of training views; 0 where the scene alone knows it (every frame that is not held out).
+        seed: of every random number.
+        preset: where the configuration started from.
+        backbone: name of the field.
+        config: the whole `gridreg.training.RunConfig` as plain data, the composition spelled out.
+        size: width of the images in pixels, instead of the protocol's.
+        test: indices into the test frames, instead of the protocol's.
+
+    Example:
+        >>> spec = RunSpec("none", None, "builtin8", 8, 0, "quick", "vm", {"composition": [], "seed": 0})
+        >>> spec.scene_name, len(spec.hash)
+        ('builtin', 16)
+    """
+
+    label: str
+    scene: str | None
+    protocol: str
+    views: int
+    seed: int
+    preset: str
+    backbone: str
+    config: dict[str, Any] = field(hash=False)
+    size: int | None = None
+    test: tuple[int, ...] | None = None
+
+    @property
+    def scene_name(self) -> str:
+        """The last part of the scene's path, or ``builtin``."""
+        return _BUILTIN if self.scene is None else Path(self.scene).name
+
+    @cached_property
+    def hash(self) -> str:
+        """16 hexadecimal digits of everything that determines the result.
+
+        The scene goes in by its name, because it may lie elsewhere on another machine; the store compares the
+        fingerprints of what was trained on. Names of row and preset, and how often a checkpoint is written, stay
+        out: they change nothing. So does the number of threads, which is recorded with the result.
+        """
+        config = {key: value for key, value in self.config.items() if key not in ("scene", "preset")}
+        if isinstance(config.get("train"), dict):
+            config["train"] = {k: v for k, v in config["train"].items() if k != "checkpoint_minutes"}
+        content = {
+            "numerics": NUMERICS_VERSION,
+            "scene": self.scene_name,
+            "protocol": self.protocol,
+            "seed": self.seed,
+            "backbone": self.backbone,
+            "size": self.size,
+            "test": None if self.test is None else list(self.test),
+            "config": config,
+        }
+        text = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=True)
+        return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()[:16]
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data for a database or a file."""
+        return asdict(self)
+
+    @staticmethod
+    def from_json(data: dict[str, Any]) -> RunSpec:
+        """Undo `to_json`.
+
+        Raises:
+            InputError: if a key is missing or unknown.
+        """
+        values = dict(data)
+        if values.get("test") is not None:
+            values["test"] = tuple(values["test"])
+        try:
+            return RunSpec(**values)
+        except TypeError as error:
+            raise InputError(f"run: {error}; expected the keys of a RunSpec") from None
+
+    def describe(self) -> str:
+        """The run in one line, for people.
+
+        Example:
+            >>> RunSpec("none", "scenes/lego", "dietnerf8", 8, 0, "quick", "vm", {}).describe()
+            'none | lego | dietnerf8 | quick vm | seed 0'
+        """
+        parts = (
+            self.label,
+            self.scene_name,
+            self.protocol,
+            f"{self.preset} {self.backbone}",
+            f"seed {self.seed}",
+        )
+        return " | ".join(parts)
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """A run and what is known of it.
+
+    Args:
+        spec: what determines it; its label is that of the study that was asked for.
+        status: ``waiting``, ``running``, ``done`` or ``failed``.
+        metrics: of a finished run, what `gridreg.training.execute` returned (``mean``, ``images``, ``seconds`` by
+            phase, ``steps``, ``versions``, ...); None before.
+        reason: of a failed run, one line.
+        folder: holds ``test/*.png``, ``history.jsonl``, ``config.yaml``, ``checkpoint/``, ``result.json``.
+        seconds: the run took, interruptions left out; 0 before it is finished.
+        machine: that finished it.
+    """
+
+    spec: RunSpec
+    status: Status
+    metrics: dict[str, Any] | None
+    reason: str
+    folder: Path
+    seconds: float
+    machine: str
+
+    def history(self) -> list[dict[str, Any]]:
+        """Rows of the run's curves, ``{"step": n, name: value, ...}``, masks under ``masks``; empty if there are none.
+
+        Raises:
+            InputError: if the file cannot be read.
+        """
+        path = self.folder / "history.jsonl"
+        try:
+            lines = path.read_text(encoding="utf-8").splitlines()
+            return [json.loads(line) for line in lines if line.strip()]
+        except FileNotFoundError:
+            return []
+        except (OSError, ValueError) as error:
+            raise InputError(f"{path}: cannot read the history: {error}") from error
+
+
+@dataclass(frozen=True)
+class Study:
+    """A question: rows to compare, on scenes, view counts and seeds.
+
+    Args:
+        name: its name in the store.
+        title: for people.
+        baseline: label of the row that the others are compared with.
+        runs: every run, row by row; runs of two rows may be one and the same (equal ``hash``).
+        source: the YAML text it was read from.
+        modules: imported by whoever runs it, for regularizers and fields of one's own.
+    """
+
+    name: str
+    title: str
+    baseline: str
+    runs: tuple[RunSpec, ...]
+    source: str
+    modules: tuple[str, ...] = ()
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Labels of the rows, in the order of the study."""
+        return tuple(dict.fromkeys(run.label for run in self.runs))
+
+    @property
+    def hashes(self) -> tuple[str, ...]:
+        """Hashes of the runs, each once, in the order of the study."""
+        return tuple(dict.fromkeys(run.hash for run in self.runs))
