@@ -1,0 +1,246 @@
+"""Compositions as plain data, taken apart and put together: find, remove, replace and add single regularizers."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping, Sequence
+from fnmatch import fnmatchcase
+from typing import Any
+
+from gridreg.base import REGISTRY
+from gridreg.compose import from_config, to_config
+from gridreg.compositions import composition, composition_names
+from gridreg.errors import InputError
+from gridreg.training.presets import load_preset, preset_names
+
+__all__ = [
+    "Plain",
+    "added",
+    "change_argument",
+    "known_composition",
+    "matches",
+    "normalised",
+    "parts_of",
+    "refuse_unknown",
+    "removed",
+    "replaced",
+    "title_of",
+]
+
+Plain = list[dict[str, Any]]
+"""A composition as `gridreg.to_config` writes it."""
+
+
+def refuse_unknown(found: Mapping[str, Any], valid: Sequence[str], what: str) -> None:
+    """Refuse keys that are not valid, with the nearest that is.
+
+    Raises:
+        InputError: for the first unknown key.
+    """
+    for key in found:
+        if key not in valid:
+            near = difflib.get_close_matches(str(key), valid, n=1, cutoff=0.5)
+            hint = f", did you mean {near[0]!r}?" if near else ";"
+            raise InputError(f"{what}: unknown key {key!r}{hint} valid: {', '.join(valid)}")
+
+
+def normalised(entries: Any) -> Plain:
+    """The composition with every argument written out, so that equal compositions are equal data.
+
+    Entries may be bare names: ``[RandomBackground]`` is ``[{name: RandomBackground}]``.
+
+    Raises:
+        InputError: for unknown regularizers and arguments.
+
+    Example:
+        >>> normalised([{"name": "L1", "site": "density"}])
+        [{'name': 'L1', 'site': 'density', 'weight': 8e-05}]
+    """
+    if not isinstance(entries, (list, tuple)):
+        raise InputError(f"found {entries!r}, expected a list of regularizers")
+    return to_config(from_config([{"name": e} if isinstance(e, str) else e for e in entries]))
+
+
+def known_composition(name: str) -> Plain:
+    """A composition by its name, or by the name of the preset that holds it.
+
+    Raises:
+        InputError: if there is neither, with the names there are.
+    """
+    if name in composition_names():
+        return to_config(composition(name))
+    if name in preset_names():
+        held = load_preset(name).composition
+        return to_config(composition(held)) if isinstance(held, str) else normalised(held)
+    valid = [*composition_names(), *(n for n in preset_names() if n not in composition_names())]
+    near = difflib.get_close_matches(name, valid, n=1, cutoff=0.5)
+    hint = f"; did you mean {near[0]!r}?" if near else ""
+    raise InputError(f"unknown composition {name!r}, expected one of {', '.join(valid)}{hint}")
+
+
+def title_of(regularizer: Mapping[str, Any]) -> str:
+    """Name and site of a regularizer, for labels.
+
+    Example:
+        >>> title_of({"name": "L1", "site": "density"}), title_of({"name": "RandomBackground"})
+        ('L1 density', 'RandomBackground')
+    """
+    site = _site(regularizer)
+    return f"{regularizer['name']} {site}" if site else str(regularizer["name"])
+
+
+def matches(regularizer: Mapping[str, Any], selector: Any) -> bool:
+    """Whether a selector means this regularizer.
+
+    Args:
+        regularizer: as plain data.
+        selector: ``"NAME"``, ``"NAME SITE"`` or ``{name: NAME, site: SITE}`` with either key; the site may hold ``*``.
+
+    Raises:
+        InputError: if it is none of these.
+    """
+    name, site = _selector(selector)
+    if name is not None and regularizer["name"] != name:
+        return False
+    return site is None or fnmatchcase(_site(regularizer), site)
+
+
+def removed(plain: Plain, selectors: Any) -> Plain:
+    """The composition without the regularizers that any of the selectors means.
+
+    Raises:
+        InputError: if a selector means none of them.
+    """
+    for selector in _listed(selectors, "remove"):
+        _check_match(plain, selector, "remove")
+        plain = [regularizer for regularizer in plain if not matches(regularizer, selector)]
+    return plain
+
+
+def replaced(plain: Plain, entries: Any) -> Plain:
+    """The composition with single regularizers changed or swapped.
+
+    Args:
+        plain: the composition.
+        entries: each ``{name:, site:, with: {...}}``: what it means gets the arguments of ``with``; where
+            ``with`` holds a name, it takes the place of the whole regularizer (the site stays, unless given).
+
+    Raises:
+        InputError: if an entry means none of them, or a regularizer has no such argument.
+    """
+    for entry in _listed(entries, "replace"):
+        if not isinstance(entry, Mapping) or not isinstance(entry.get("with"), Mapping):
+            raise InputError(f"replace: found {entry!r}, expected {{name: NAME, site: SITE, with: {{...}}}}")
+        refuse_unknown(entry, ("name", "site", "with"), "replace")
+        selector = {key: value for key, value in entry.items() if key != "with"}
+        _check_match(plain, selector, "replace")
+        plain = [_changed(r, entry["with"]) if matches(r, selector) else r for r in plain]
+    return normalised(plain)
+
+
+def added(plain: Plain, entries: Any) -> Plain:
+    """The composition with further regularizers at its end."""
+    return [*plain, *normalised(_listed(entries, "add"))]
+
+
+def change_argument(plain: Plain, selector: Any, argument: str, value: Any) -> Plain:
+    """The composition with one argument of the selected regularizers set.
+
+    Raises:
+        InputError: if the selector means none, or they have no such argument.
+    """
+    _check_match(plain, selector, "change")
+    return normalised([{**r, argument: value} if matches(r, selector) else r for r in plain])
+
+
+def parts_of(plain: Plain, parts: Any, by: str) -> dict[str, Plain]:
+    """The composition in named parts.
+
+    Args:
+        plain: the composition.
+        parts: selectors (one or a list) by the name of the part; None: made from ``by``.
+        by: ``name`` (all regularizers of a class are one part), ``site``, or ``each``.
+
+    Raises:
+        InputError: for parts that hold nothing, or share a regularizer.
+    """
+    if parts is None:
+        return _automatic_parts(plain, by)
+    if not isinstance(parts, Mapping) or not parts:
+        raise InputError(f"parts: found {parts!r}, expected names of parts, each with its regularizers")
+    found: dict[str, Plain] = {}
+    taken: dict[int, str] = {}
+    for name, selectors in parts.items():
+        chosen: Plain = []
+        for selector in selectors if isinstance(selectors, list) else [selectors]:
+            _check_match(plain, selector, f"parts: {name}")
+            for index, regularizer in enumerate(plain):
+                if matches(regularizer, selector) and taken.get(index) != name:
+                    if index in taken:
+                        raise InputError(
+                            f"parts: {title_of(regularizer)} is in {taken[index]!r} and in {name!r}; expected once"
+                        )
+                    taken[index] = name
+                    chosen.append(regularizer)
+        found[name] = chosen
+    return found
+
+
+def _automatic_parts(plain: Plain, by: str) -> dict[str, Plain]:
+    keys = {"name": lambda r: str(r["name"]), "site": lambda r: _site(r) or str(r["name"]), "each": title_of}
+    if by not in keys:
+        raise InputError(f"by: found {by!r}, expected one of {', '.join(keys)}")
+    found: dict[str, Plain] = {}
+    for regularizer in plain:
+        found.setdefault(keys[by](regularizer), []).append(regularizer)
+    return found
+
+
+def _changed(regularizer: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    if "name" not in changes:
+        return {**regularizer, **changes}
+    kept = {"site": regularizer["site"]} if "site" in regularizer and "site" not in changes else {}
+    return {**kept, **changes}
+
+
+def _site(regularizer: Mapping[str, Any]) -> str:
+    """The site as text: its name, or the pattern of a selector."""
+    site = regularizer.get("site")
+    if isinstance(site, Mapping):
+        return (
+            " ".join(str(site[kind]) for kind in ("parameters", "outputs", "inputs") if kind in site)
+            or "site"
+        )
+    return "" if site is None else str(site)
+
+
+def _selector(selector: Any) -> tuple[str | None, str | None]:
+    if isinstance(selector, str) and selector.strip():
+        name, _, site = selector.strip().partition(" ")
+        found: tuple[str | None, str | None] = (name, site.strip() or None)
+    elif isinstance(selector, Mapping) and selector:
+        refuse_unknown(selector, ("name", "site"), "regularizer")
+        found = (selector.get("name"), selector.get("site"))
+    else:
+        raise InputError(f"found {selector!r}, expected NAME, NAME SITE or {{name: NAME, site: SITE}}")
+    if found[0] is not None and found[0] not in REGISTRY:
+        near = difflib.get_close_matches(str(found[0]), sorted(REGISTRY), n=1, cutoff=0.5)
+        raise InputError(
+            f"unknown regularizer {found[0]!r}" + (f", did you mean {near[0]!r}?" if near else "")
+        )
+    return found
+
+
+def _check_match(plain: Plain, selector: Any, what: str) -> None:
+    if not [regularizer for regularizer in plain if matches(regularizer, selector)]:
+        there = ", ".join(title_of(r) for r in plain) or "no regularizer at all"
+        shown = selector if isinstance(selector, str) else " ".join(str(v) for v in dict(selector).values())
+        raise InputError(f"{what}: found {shown!r}, which the composition does not have; it has {there}")
+
+
+def _listed(value: Any, what: str) -> list[Any]:
+    if isinstance(value, (str, Mapping)):
+        return [value]
+    if not isinstance(value, list) or not value:
+        raise InputError(f"{what}: found {value!r}, expected a list of regularizers")
+    return value

@@ -1,0 +1,319 @@
+"""Studies as YAML: which rows to compare, on which scenes, protocols or view counts, and seeds.
+
+    title: What do the masks do?
+    scenes: [lego, chair]           # below `data`, paths, or `builtin`; default: builtin
+    data: ../data                   # default: the environment variable GRIDREG_DATA
+    views: [3, 8]                   # or protocols: [dietnerf8]
+    seeds: [0, 1, 2]
+    presets: [quick]
+    set: {train.rays: 512}          # any value of RunConfig, for every run
+    baseline: none
+    compositions:
+      - none                                                   # by name, or `preset` for the preset's own
+      - {name: few_tensorf, remove: [OcclusionLoss]}           # changed
+      - {label: own, regularizers: [{name: RandomBackground}]} # inline
+      - {leave_one_out: quick}                                 # generators
+      - {one_at_a_time: quick, on: none}
+
+`gridreg.ablation.rows` holds the grammar of the rows.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gridreg.ablation.records import RunSpec, Study
+from gridreg.ablation.rows import Row, expand_rows
+from gridreg.errors import InputError
+from gridreg.scenes.protocols import Every, Listed, Protocol, get_protocol
+from gridreg.training.config import from_data, override, to_data
+from gridreg.training.options import TrainOptions, configure
+from gridreg.training.presets import load_preset
+from gridreg.training.settings import RunConfig
+from gridreg.training.strict_yaml import parse_yaml
+
+__all__ = ["BUILTIN_FRAMES", "DATA_VARIABLE", "StudyFile", "import_modules", "load_study", "study_from_text"]
+
+DATA_VARIABLE = "GRIDREG_DATA"
+BUILTIN_FRAMES = 18
+_MOST_RUNS = 100_000
+
+
+@dataclass(frozen=True)
+class StudyFile:
+    """The keys of a study's YAML file.
+
+    Args:
+        compositions: the rows, see `gridreg.ablation.rows`.
+        name: in the store; default: the file's name without its ending.
+        title: for people; default: the name.
+        baseline: label of the row that others are compared with; default: the first row.
+        scenes: names of folders below ``data``, paths, or ``builtin``.
+        data: folder of the scenes, relative to the study's file; default: the environment variable GRIDREG_DATA.
+        protocols: names, see `gridreg.scenes.PROTOCOLS`; default: ``dietnerf8``, for the built-in scene ``builtin8``.
+        views: numbers of training views instead of protocols: ``views<N>``, for the built-in scene ``first<N>``.
+        seeds: of every random number.
+        presets: names; where there are several, rows are labelled with them.
+        backbones: names; default: each preset's own.
+        steps: iterations, events of the schedule in proportion; default: each preset's own.
+        set: values of the configuration by dotted key, for every run.
+        size: width of the images in pixels instead of the protocol's.
+        test: indices into the test frames instead of the protocol's.
+        modules: Python modules that register regularizers, compositions or fields of one's own.
+    """
+
+    compositions: list[Any]
+    name: str | None = None
+    title: str | None = None
+    baseline: str | None = None
+    scenes: list[str] = dataclasses.field(default_factory=lambda: ["builtin"])
+    data: str | None = None
+    protocols: list[str] | None = None
+    views: list[int] | None = None
+    seeds: list[int] = dataclasses.field(default_factory=lambda: [0])
+    presets: list[str] = dataclasses.field(default_factory=lambda: ["quick"])
+    backbones: list[str] | None = None
+    steps: int | None = None
+    set: dict[str, Any] = dataclasses.field(default_factory=dict)
+    size: int | None = None
+    test: list[int] | None = None
+    modules: list[str] = dataclasses.field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        for key in ("compositions", "scenes", "seeds", "presets", "protocols", "views", "backbones"):
+            values = getattr(self, key)
+            if values == []:
+                raise InputError(f"{key}: found an empty list; a study without runs; expected at least one")
+            if values is not None and key != "compositions" and len(set(values)) < len(values):
+                raise InputError(f"{key}: found {values}, expected each value once")
+        if self.protocols is not None and self.views is not None:
+            raise InputError("views: found beside protocols; expected one of the two")
+        for count in self.views or ():
+            if count < 1:
+                raise InputError(f"views: found {count}, expected numbers of training views from 1")
+        for name, value in (("steps", self.steps), ("size", self.size)):
+            if value is not None and value < 1:
+                raise InputError(f"{name}: found {value}, expected an integer of at least 1")
+
+
+def load_study(path: str | os.PathLike[str]) -> Study:
+    """Read a study.
+
+    Raises:
+        InputError: one line that names file, line and key of what is wrong: unknown keys with the nearest valid one,
+            unknown compositions, scenes, protocols, presets or fields, a study without runs.
+    """
+    file = Path(path)
+    try:
+        text = file.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise InputError(f"{file}: no such file; expected a study in YAML") from None
+    except UnicodeDecodeError as error:
+        raise InputError(f"{file}: not UTF-8 text at byte {error.start}") from error
+    except OSError as error:
+        raise InputError(f"{file}: cannot read: {error.strerror}") from error
+    return study_from_text(text, source=str(file), name=file.stem, folder=file.parent)
+
+
+def study_from_text(
+    text: str, *, source: str = "study", name: str = "study", folder: Path | None = None
+) -> Study:
+    """A study from its YAML text.
+
+    Args:
+        text: the YAML.
+        source: names it in errors.
+        name: used where the text gives none.
+        folder: that ``data`` is relative to; default: the current one.
+
+    Raises:
+        InputError: as `load_study`.
+
+    Example:
+        >>> study = study_from_text("compositions: [none, tensorf]\\nseeds: [0, 1]")
+        >>> [(run.label, run.seed) for run in study.runs]
+        [('none', 0), ('none', 1), ('tensorf', 0), ('tensorf', 1)]
+    """
+    document = parse_yaml(text, source)
+    file = from_data(
+        StudyFile, {} if document.data is None else document.data, source=source, lines=document.lines
+    )
+    import_modules(file.modules, source)
+
+    def where(*path: str | int) -> str:
+        line = next(
+            (document.lines[path[:n]] for n in range(len(path), 0, -1) if path[:n] in document.lines), None
+        )
+        return f"{source}:{line}" if line else source
+
+    rows: list[Row] = []
+    for index, entry in enumerate(file.compositions):
+        try:
+            rows += expand_rows(entry)
+        except InputError as error:
+            raise InputError(f"{where('compositions', index)}: compositions: {error}") from None
+    try:
+        scenes = [_scene_folder(scene, file, folder or Path()) for scene in file.scenes]
+        _refuse_same_names(scenes)
+        runs = tuple(_runs(file, rows, scenes))
+    except InputError as error:
+        key = str(error).partition(":")[0]
+        raise InputError(f"{where(key)}: {error}") from None
+    labels = list(dict.fromkeys(run.label for run in runs))
+    baseline = _baseline(file, labels, where)
+    study_name = file.name or re.sub(r"[^\w.-]+", "-", name)
+    return Study(study_name, file.title or study_name, baseline, runs, text, tuple(file.modules))
+
+
+def _runs(file: StudyFile, rows: Sequence[Row], scenes: Sequence[Path | None]) -> list[RunSpec]:
+    """Every run, row by row."""
+    if len(rows) * len(scenes) * len(file.seeds) > _MOST_RUNS:
+        raise InputError(
+            f"compositions: found {len(rows)} rows, expected a study of at most {_MOST_RUNS} runs"
+        )
+    runs: list[RunSpec] = []
+    seen: dict[str, str] = {}
+    for row in rows:
+        presets = [row.preset] if row.preset else file.presets
+        for preset in presets:
+            backbones = [row.backbone] if row.backbone else (file.backbones or [load_preset(preset).backbone])
+            for backbone in backbones:
+                marks = [preset] * (len(presets) > 1) + [backbone] * (len(backbones) > 1)
+                label = f"{row.label} [{', '.join(marks)}]" if marks else row.label
+                config = _config(file, row, preset, backbone)
+                content = str(to_data(config))
+                if seen.setdefault(label, content) != content:
+                    raise InputError(f"compositions: two rows are called {label!r}; give one another label")
+                runs += _row_runs(file, label, config, scenes)
+    unique = {(run.label, run.hash): run for run in runs}
+    return list(unique.values())
+
+
+def _row_runs(file: StudyFile, label: str, config: RunConfig, scenes: Sequence[Path | None]) -> list[RunSpec]:
+    runs = []
+    for scene in scenes:
+        for protocol in _protocols(file, scene):
+            for seed in file.seeds:
+                path = None if scene is None else str(scene)
+                full = dataclasses.replace(config, scene=path, protocol=protocol.name, seed=seed)
+                runs.append(
+                    RunSpec(
+                        label=label,
+                        scene=path,
+                        protocol=protocol.name,
+                        views=_view_count(protocol),
+                        seed=seed,
+                        preset=config.preset,
+                        backbone=config.backbone,
+                        config=to_data(full),
+                        size=file.size,
+                        test=None if file.test is None else tuple(file.test),
+                    )
+                )
+    return runs
+
+
+def _config(file: StudyFile, row: Row, preset: str, backbone: str) -> RunConfig:
+    """Preset, then field, composition, the study's values, the row's values, and the number of steps."""
+    config = configure(TrainOptions(preset=preset, backbone=backbone))
+    config = dataclasses.replace(config, composition=row.composition(config.composition))
+    for key, changes in (("set", file.set), ("compositions", row.set)):
+        for fixed in ("scene", "protocol", "seed", "preset", "backbone"):
+            if fixed in changes:
+                raise InputError(
+                    f"{key}: found {fixed!r}; expected the study's own key for it, not a value to set"
+                )
+        try:
+            config = override(
+                config, changes, source=f"set of {row.label!r}" if key == "compositions" else "set"
+            )
+        except InputError as error:
+            raise InputError(f"{key}: {str(error).removeprefix('set: ')}") from None
+    steps = row.steps or file.steps
+    return config if steps is None else dataclasses.replace(config, train=config.train.scaled(steps))
+
+
+def _protocols(file: StudyFile, scene: Path | None) -> list[Protocol]:
+    if file.views is None:
+        names = file.protocols or ["builtin8" if scene is None else "dietnerf8"]
+        try:
+            return [get_protocol(name) for name in names]
+        except InputError as error:
+            raise InputError(f"protocols: {str(error).removeprefix('protocol: ')}") from None
+    if scene is None and max(file.views) > BUILTIN_FRAMES:
+        raise InputError(
+            f"views: found {max(file.views)}, but the built-in scene has {BUILTIN_FRAMES} training frames; "
+            "expected fewer, or scenes of your own"
+        )
+    # The built-in scene's frames are in an order made for taking the first ones.
+    return [get_protocol(f"{'first' if scene is None else 'views'}{count}") for count in file.views]
+
+
+def _view_count(protocol: Protocol) -> int:
+    if isinstance(protocol.train, Every):
+        return 0
+    return len(protocol.train.indices) if isinstance(protocol.train, Listed) else protocol.train.count
+
+
+def _scene_folder(name: str, file: StudyFile, folder: Path) -> Path | None:
+    """The folder of a scene, or None for the built-in one."""
+    if name == "builtin":
+        return None
+    data = folder / Path(file.data).expanduser() if file.data else None
+    if data is None and os.environ.get(DATA_VARIABLE):
+        data = Path(os.environ[DATA_VARIABLE])
+    places = [data / name] if data is not None else []
+    if data is None or len(Path(name).parts) > 1:
+        places += [folder / Path(name).expanduser()]
+    for place in places:
+        if place.is_dir():
+            return place.resolve()
+    hint = "" if data is not None else f"; the folder of scenes is given with data: or in {DATA_VARIABLE}"
+    near = (
+        sorted(path.name for path in data.iterdir() if path.is_dir())[:20] if data and data.is_dir() else []
+    )
+    known = f" there are {', '.join(near)}" if near else ""
+    looked = " or ".join(str(place) for place in places)
+    raise InputError(
+        f"scenes: found {name!r}, but there is no folder {looked}{hint};{known or ' expected a scene'}"
+    )
+
+
+def _refuse_same_names(scenes: Sequence[Path | None]) -> None:
+    names = [scene.name for scene in scenes if scene is not None]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice or "builtin" in names:
+        raise InputError(
+            f"scenes: two folders are called {(twice or ['builtin'])[0]!r}; rename one, results go by it"
+        )
+
+
+def _baseline(file: StudyFile, labels: Sequence[str], where: Any) -> str:
+    if file.baseline is None:
+        return labels[0]
+    fitting = [label for label in labels if label == file.baseline or label.startswith(f"{file.baseline} [")]
+    if not fitting:
+        raise InputError(
+            f"{where('baseline')}: baseline: found {file.baseline!r}, expected one of the rows {', '.join(labels)}"
+        )
+    return fitting[0]
+
+
+def import_modules(modules: Sequence[str], source: str) -> None:
+    """Import the modules that register what a study uses beyond gridreg's own.
+
+    Raises:
+        InputError: if one cannot be imported.
+    """
+    for module in modules:
+        try:
+            importlib.import_module(module)
+        except ImportError as error:
+            raise InputError(f"{source}: modules: cannot import {module!r}: {error}") from error
