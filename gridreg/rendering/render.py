@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -230,13 +231,17 @@ def render_image(
     *,
     background: Tensor,
     chunk: int = 1 << 12,
+    warp: Callable[[Rays], Rays] | None = None,
 ) -> Rendered:
     """Render one picture; the result does not depend on ``chunk``.
+
+    ``warp`` maps the camera's rays to the field's coordinates where these are not the world's (forward-facing scenes).
 
     Returns:
         colour ``(H, W, 3)`` clamped to [0, 1], opacity and depth ``(H, W)``.
     """
     rays = camera_rays(pose, intrinsics, height, width)
+    rays = rays if warp is None else warp(rays)
     parts = [
         render_rays(field, rays[start : start + chunk], occupancy, march, background=background)
         for start in range(0, len(rays), chunk)

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gridreg.rendering import March, OccupancyGrid, Rendered, render_image
+from gridreg.rendering import March, OccupancyGrid, Rays, Rendered, render_image
 from gridreg.scenes import Views
 from gridreg.training.metrics import image_metrics, psnr
 
@@ -34,12 +34,26 @@ class Scored:
 
 
 def render_views(
-    field: Any, views: Views, occupancy: OccupancyGrid, march: March, background: Tensor
+    field: Any,
+    views: Views,
+    occupancy: OccupancyGrid,
+    march: March,
+    background: Tensor,
+    *,
+    warp: Callable[[Rays], Rays] | None = None,
 ) -> Iterator[Rendered]:
     """Pictures of a field from the cameras of views, one after the other."""
     for pose, intrinsics in zip(views.poses, views.intrinsics, strict=True):
         yield render_image(
-            field, pose, intrinsics, views.height, views.width, occupancy, march, background=background
+            field,
+            pose,
+            intrinsics,
+            views.height,
+            views.width,
+            occupancy,
+            march,
+            background=background,
+            warp=warp,
         )
 
 
@@ -50,11 +64,13 @@ def score_views(
     march: March,
     background: Tensor,
     each: Callable[[Scored], None] | None = None,
+    *,
+    warp: Callable[[Rays], Rays] | None = None,
 ) -> list[Scored]:
     """Render and score every view; ``each`` is told as soon as one is done."""
     scored = []
     targets = views.composited(background)
-    pictures = render_views(field, views, occupancy, march, background)
+    pictures = render_views(field, views, occupancy, march, background, warp=warp)
     for name, rendered, target in zip(views.names, pictures, targets, strict=True):
         one = Scored(name, rendered, target, image_metrics(rendered.colour, target))
         scored.append(one)
@@ -64,7 +80,14 @@ def score_views(
 
 
 def mean_psnr_of(
-    field: Any, views: Views, occupancy: OccupancyGrid, march: March, background: Tensor, stride: int = 1
+    field: Any,
+    views: Views,
+    occupancy: OccupancyGrid,
+    march: March,
+    background: Tensor,
+    stride: int = 1,
+    *,
+    warp: Callable[[Rays], Rays] | None = None,
 ) -> float:
     """Mean PSNR (dB) over every ``stride``-th view, for a look on the way."""
     chosen = slice(None, None, stride)
@@ -76,6 +99,6 @@ def mean_psnr_of(
         views.ids[chosen],
     )
     targets = some.composited(background)
-    pictures = render_views(field, some, occupancy, march, background)
+    pictures = render_views(field, some, occupancy, march, background, warp=warp)
     values = [psnr(p.colour, t) for p, t in zip(pictures, targets, strict=True)]
     return float(torch.tensor(values, dtype=torch.float64).mean())

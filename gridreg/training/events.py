@@ -89,7 +89,7 @@ def resample(trainer: Trainer) -> None:
 def _rebuild(trainer: Trainer) -> None:
     resolution = occupancy_resolution(trainer.field, trainer.settings)
     trainer.occupancy = trainer.occupancy.at(trainer.field.bounds, resolution)
-    if trainer.settings.carve:
+    if trainer.carves:
         hull = OccupancyGrid.full(trainer.field.bounds, resolution)
         views = trainer.scene.train
         hull.cells = visual_hull(hull, views.rgba[..., 3], views.poses, views.intrinsics)

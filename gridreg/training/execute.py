@@ -109,7 +109,13 @@ class Execution:
         began = time.perf_counter()
         trainer.field.eval()
         value = mean_psnr_of(
-            trainer.field, views, trainer.occupancy, trainer.march, self.scene.background, stride
+            trainer.field,
+            views,
+            trainer.occupancy,
+            trainer.march,
+            self.scene.background,
+            stride,
+            warp=trainer.warp,
         )
         trainer.field.train()
         # What a look costs is not training time.
@@ -147,7 +153,13 @@ class Execution:
 
         done: list[Scored] = []
         scored = score_views(
-            trainer.field, self.scene.test, trainer.occupancy, trainer.march, self.scene.background, each
+            trainer.field,
+            self.scene.test,
+            trainer.occupancy,
+            trainer.march,
+            self.scene.background,
+            each,
+            warp=trainer.warp,
         )
         trainer.field.train()
         self.seconds["test"] = time.perf_counter() - began

@@ -3,14 +3,51 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from gridreg.rendering import OccupancyGrid, Rays, backends, box_intersection, pixel_rays
-from gridreg.scenes import Views
+from gridreg.scenes import Scene, Views, ndc_rays
 
-__all__ = ["RayBank", "meets"]
+__all__ = ["NdcWarp", "RayBank", "meets", "warp_of"]
+
+
+@dataclass(frozen=True)
+class NdcWarp:
+    """Maps rays of forward-facing cameras to normalised device coordinates, see `gridreg.scenes.ndc_rays`.
+
+    Args:
+        intrinsics: fx, fy, cx, cy in pixels of the average camera.
+        height, width: of its pictures, pixels.
+    """
+
+    intrinsics: tuple[float, float, float, float]
+    height: int
+    width: int
+
+    def __call__(self, rays: Rays) -> Rays:
+        """The mapped rays; distances along them are those of the normalised coordinates.
+
+        A ray that does not look along -z meets no plane before the cameras; it is sent out of the box.
+        """
+        forward = rays.directions[:, 2:] < -1e-3
+        safe = torch.where(forward, rays.directions, rays.directions.new_tensor([0.0, 0.0, -1.0]))
+        lens = torch.tensor(self.intrinsics, device=rays.origins.device)
+        origins, directions = ndc_rays(rays.origins, safe, lens, self.height, self.width)
+        seen = forward & torch.isfinite(origins) & torch.isfinite(directions)
+        nowhere, away = origins.new_tensor([0.0, 0.0, -10.0]), origins.new_tensor([0.0, 0.0, -1.0])
+        seen = seen.all(dim=-1, keepdim=True)
+        return Rays(torch.where(seen, origins, nowhere), torch.where(seen, directions, away))
+
+
+def warp_of(scene: Scene) -> NdcWarp | None:
+    """The map from the rays of a scene's cameras to the field's coordinates; None where these are the world's."""
+    if not scene.ndc:
+        return None
+    fx, fy, cx, cy = scene.train.intrinsics.double().mean(dim=0).tolist()
+    return NdcWarp((fx, fy, cx, cy), scene.train.height, scene.train.width)
 
 
 class RayBank:
@@ -18,10 +55,11 @@ class RayBank:
 
     Args:
         views: ``V`` pictures of ``H x W``.
+        warp: maps their rays to the field's coordinates; None: these are the world's.
     """
 
-    def __init__(self, views: Views) -> None:
-        self.views = views
+    def __init__(self, views: Views, warp: NdcWarp | None = None) -> None:
+        self.views, self.warp = views, warp
         self.count, self.height, self.width = views.rgba.shape[:3]
         self.pixels = views.rgba.reshape(-1, 4)
         self.active = torch.arange(self.pixels.shape[0], device=self.pixels.device)
@@ -30,9 +68,10 @@ class RayBank:
         """Rays through pixels given by flat index ``(R,)``."""
         view = index // (self.height * self.width)
         inside = index % (self.height * self.width)
-        return pixel_rays(
+        rays = pixel_rays(
             self.views.poses[view], self.views.intrinsics[view], inside // self.width, inside % self.width
         )
+        return rays if self.warp is None else self.warp(rays)
 
     def draw(self, count: int, generator: torch.Generator) -> tuple[Rays, Tensor]:
         """``count`` random rays among the active ones and their RGBA ``(R, 4)``, with replacement."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +12,13 @@ import gridreg
 from gridreg.base import Regularizer
 from gridreg.errors import InputError
 from gridreg.fields import make_field
+from gridreg.handle import Handle
 from gridreg.rendering import March, OccupancyGrid
 from gridreg.scenes import Scene, builtin_scene, load_scene
 from gridreg.training import events
 from gridreg.training.checkpoint import has_checkpoint, load_checkpoint, save_checkpoint
 from gridreg.training.config import from_data, to_data
+from gridreg.training.rays import NdcWarp
 from gridreg.training.settings import RunConfig
 from gridreg.training.trainer import Trainer, load_field
 
@@ -54,7 +56,7 @@ def regularizers_of(config: RunConfig) -> list[Regularizer]:
 def build_trainer(config: RunConfig, scene: Scene) -> Trainer:
     """Field and trainer of a configuration, at step 0."""
     settings = config.train
-    bounds = events.carved_box(scene) if settings.carve else scene.bounds
+    bounds = events.carved_box(scene) if settings.carve and not scene.ndc else scene.bounds
     field = make_field(
         config.backbone,
         bounds,
@@ -75,6 +77,7 @@ def save_run(folder: Path, trainer: Trainer, config: RunConfig, record: dict[str
     state = {
         "trainer": trainer.state_dict(),
         "march": {"near": trainer.scene.near, "far": trainer.scene.far},
+        "warp": None if trainer.warp is None else asdict(trainer.warp),
         "bounds": trainer.scene.bounds,
         "background": trainer.scene.background,
         "record": record,
@@ -107,7 +110,19 @@ def resume_trainer(folder: Path, config: RunConfig, scene: Scene) -> tuple[Train
 
 @dataclass(frozen=True)
 class LoadedRun:
-    """A trained field and all it takes to render it."""
+    """A trained field and all it takes to render it.
+
+    Args:
+        field: in eval mode.
+        occupancy: cells that may hold something.
+        march: step and range of the rays.
+        background: ``(3,)`` colour behind the field.
+        config: of the run.
+        step: iterations done.
+        handle: of the regularizers; masks that are not fully open act only as long as it is kept.
+        fingerprint: of the scene it was trained on, see `gridreg.scenes.Scene`.
+        warp: maps rays of cameras to the field's coordinates; None: these are the world's.
+    """
 
     field: Any
     occupancy: OccupancyGrid
@@ -115,6 +130,9 @@ class LoadedRun:
     background: torch.Tensor
     config: RunConfig
     step: int
+    handle: Handle
+    fingerprint: str
+    warp: NdcWarp | None = None
 
 
 def load_run(folder: str | Path) -> LoadedRun:
@@ -137,6 +155,7 @@ def load_run(folder: str | Path) -> LoadedRun:
     # Masks that are not yet open are part of what was trained.
     handle = gridreg.apply(field, *regularizers_of(config), total_steps=config.train.steps, seed=config.seed)
     handle.load_state_dict(state["handle"])
+    handle.step(min(int(state["step"]), config.train.steps))
     field.eval()
     march = March(
         step=config.train.step_ratio * events.cell_size(field),
@@ -152,4 +171,14 @@ def load_run(folder: str | Path) -> LoadedRun:
         saved.state["background"],
         config,
         int(state["step"]),
+        handle,
+        saved.fingerprint,
+        _saved_warp(saved.state.get("warp")),
     )
+
+
+def _saved_warp(saved: dict[str, Any] | None) -> NdcWarp | None:
+    if saved is None:
+        return None
+    fx, fy, cx, cy = saved["intrinsics"]
+    return NdcWarp((fx, fy, cx, cy), saved["height"], saved["width"])

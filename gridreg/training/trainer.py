@@ -16,7 +16,7 @@ from gridreg.errors import InputError
 from gridreg.rendering import March, OccupancyGrid, Rendered, render_rays
 from gridreg.scenes import Scene
 from gridreg.training import events
-from gridreg.training.rays import RayBank
+from gridreg.training.rays import RayBank, warp_of
 from gridreg.training.settings import TrainSettings
 
 __all__ = ["StepReport", "Trainer"]
@@ -50,16 +50,22 @@ class Trainer:
         self.field, self.scene, self.settings = field, scene, settings
         self.generator = torch.Generator().manual_seed(seed)
         self.handle = gridreg.apply(field, *composition, total_steps=settings.steps, seed=seed)
-        self.bank = RayBank(scene.train)
+        self.warp = warp_of(scene)
+        self.bank = RayBank(scene.train, self.warp)
         self.step = 0
         self.occupancy = OccupancyGrid.full(field.bounds, events.occupancy_resolution(field, settings))
         self._restart_at = 0
         self.optimizer = self._make_optimizer()
         self._gradient_context = getattr(field, "gradient_context", nullcontext)
-        if settings.carve:
+        if self.carves:
             events.carve(self)
         if 0 in settings.filter_rays_at:
             events.filter_rays(self)
+
+    @property
+    def carves(self) -> bool:
+        """Whether the visual hull counts; cells of normalised device coordinates have no silhouettes."""
+        return self.settings.carve and not self.scene.ndc
 
     @property
     def march(self) -> March:
