@@ -5,11 +5,10 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from backbones import kernels
 from backbones.kernels.linear import Precision
@@ -77,26 +76,14 @@ class MLPDecoder(nn.Module):
             positions: ``(N, 3)`` normalised to [-1, 1].
             ray_indices: ``(N,)``: the ray of each sample; its direction is then encoded once per ray.
         """
-        first, second, last = (cast(nn.Linear, layer) for layer in self.layers)
-        weight = first.weight
-        of_features, of_direction, _ = self.block_sizes
-        blocks = [(features, self.feature_octaves)]
-        columns = weight[:, :of_features]
+        blocks = [
+            kernels.Block(features, self.feature_octaves),
+            kernels.Block(directions, self.direction_octaves, ray_indices),
+        ]
         if self.position_octaves is not None:
-            blocks.append((positions, self.position_octaves))
-            columns = torch.cat([columns, weight[:, of_features + of_direction :]], dim=-1)
-        by_direction = F.linear(
-            kernels.encode(directions, self.direction_octaves),
-            weight[:, of_features : of_features + of_direction],
-            first.bias,
-        )
-        out = kernels.mlp(
-            kernels.encode_together(blocks),
-            [(columns, None), (second.weight, second.bias), (last.weight, last.bias)],
-            offset=by_direction,
-            rows=ray_indices,
-            precision=self.precision,
-        )
+            blocks.append(kernels.Block(positions, self.position_octaves))
+        layers = [(layer.weight, layer.bias) for layer in self.layers]
+        out = kernels.encoded_mlp(blocks, layers, precision=self.precision)  # type: ignore[arg-type]
         return torch.sigmoid(out)
 
     def sites(self, prefix: str) -> dict[str, Site]:

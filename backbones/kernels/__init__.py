@@ -15,10 +15,12 @@ from backbones.kernels.dispatch import (
     vm_march_density,
 )
 from backbones.kernels.encode import encode, encode_together
+from backbones.kernels.encoded import Block, encoded_mlp
 from backbones.kernels.linear import mlp
 
 __all__ = [
     "Activation",
+    "Block",
     "March",
     "accumulate_into_grad",
     "cp_density",
@@ -26,6 +28,7 @@ __all__ = [
     "cp_march_density",
     "encode",
     "encode_together",
+    "encoded_mlp",
     "mlp",
     "vm_density",
     "vm_features",

@@ -52,11 +52,12 @@ __all__ = [
     "real",
     "scratch",
     "size",
+    "uint16",
     "uint8",
     "vector",
 ]
 
-float32, int32, int64, uint8 = np.float32, np.int32, np.int64, np.uint8
+float32, int32, int64, uint8, uint16 = np.float32, np.int32, np.int64, np.uint8, np.uint16
 
 # Reordering and contraction make sums fast; not-a-number and infinity keep their meaning, as a run must see them.
 _FAST = {"contract", "nsz", "arcp", "reassoc"}

@@ -17,12 +17,12 @@ from gridreg.encodings import Order, positional_encoding
 from gridreg.errors import InputError
 from gridreg.rendering.backends import takes_compiled
 
-__all__ = ["encode", "encode_together"]
+__all__ = ["MOST_OCTAVES", "encode", "encode_together"]
 
 # Rows of one task.
 _ROWS = 256
 # Beyond, the doubling of angles has cost more than two digits of float32.
-_MOST_OCTAVES = 8
+MOST_OCTAVES = 8
 
 
 @inline
@@ -166,7 +166,7 @@ def encode_together(blocks: Sequence[tuple[Tensor, int]], scale: float = 1.0) ->
         if octaves < 0:
             raise InputError(f"octaves: found {octaves}, expected a number from 0 on")
     counts = tuple(octaves for _, octaves in blocks)
-    if takes_compiled(*(x for x, _ in blocks)) and max(counts) <= _MOST_OCTAVES:
+    if takes_compiled(*(x for x, _ in blocks)) and max(counts) <= MOST_OCTAVES:
         found: Tensor = _Encode.apply(counts, scale, *(x for x, _ in blocks))  # type: ignore[no-untyped-call]
         return found
     return torch.cat([positional_encoding(x, octaves, scale=scale) for x, octaves in blocks], dim=-1)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias, cast
 
 import torch
 from torch import Tensor
@@ -18,10 +18,19 @@ from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
+from backbones.kernels.chain import chain_backward, chain_forward, padded_rows
 from gridreg.errors import InputError
 from gridreg.rendering.backends import takes_compiled
 
-__all__ = ["Layer", "Precision", "bfloat16_is_fast", "mlp"]
+__all__ = [
+    "Layer",
+    "Precision",
+    "bfloat16_is_fast",
+    "check_layers",
+    "check_precision",
+    "mlp",
+    "product_dtype",
+]
 
 Precision: TypeAlias = Literal["float32", "bfloat16", "auto"]
 """Of products: "auto" is bfloat16 where `bfloat16_is_fast`, float32 elsewhere."""
@@ -53,17 +62,16 @@ def bfloat16_is_fast() -> bool:
     return supported and any(check is not None and check() for check in native)
 
 
-def _product(x: Tensor, weight: Tensor, bias: Tensor | None, relu: bool) -> Tensor:
-    """``x weight^T + bias``, then ReLU if wanted.
+def check_precision(precision: str) -> None:
+    """Raise `InputError` for an unknown one."""
+    if precision not in _PRECISIONS:
+        raise InputError(f"precision: found {precision!r}, expected one of {', '.join(_PRECISIONS)}")
 
-    By oneDNN if it can be had: MKL takes twice as long for results whose rows are not a multiple of 16 wide.
-    """
-    fused = getattr(torch.ops.mkldnn, "_linear_pointwise", None)
-    if fused is not None and torch._C._has_mkldnn and x.numel() and weight.numel():
-        found: Tensor = fused(x, weight, bias, "relu" if relu else "none", [], "")
-        return found
-    found = F.linear(x, weight, bias)
-    return found.relu_() if relu else found
+
+def product_dtype(precision: Precision) -> torch.dtype:
+    """Of products of float32 tensors on the CPU."""
+    low = precision == "bfloat16" or (precision == "auto" and bfloat16_is_fast())
+    return torch.bfloat16 if low else torch.float32
 
 
 class _MLP(Function):
@@ -76,54 +84,56 @@ class _MLP(Function):
         x: Tensor,
         *flat: Tensor | None,
     ) -> Tensor:
-        layers = [(flat[i], flat[i + 1]) for i in range(0, len(flat), 2)]
-        inputs, weights = [], []
-        hidden = x.to(dtype).contiguous()
-        for place, (weight, bias) in enumerate(layers):
-            assert weight is not None
-            relu = place + 1 < len(layers)
-            low = weight.to(dtype).contiguous()
-            low_bias = None if bias is None else bias.to(dtype)
-            inputs.append(hidden)
-            weights.append(low)
-            if place == 0 and offset is not None:
-                hidden = _product(hidden, low, low_bias, False)
-                share = offset.to(dtype)
-                hidden += share if rows is None else share.index_select(0, rows)
-                hidden = hidden.relu_() if relu else hidden
-            else:
-                hidden = _product(hidden, low, low_bias, relu)
-        ctx.save_for_backward(rows, *inputs, *weights)
-        ctx.dtype, ctx.depth = dtype, len(layers)
+        count = x.shape[0]
+        padded = torch.zeros(padded_rows(count), x.shape[1], dtype=dtype)
+        padded[:count] = x
+        share = None if offset is None else offset.to(dtype)
+        missing = padded.shape[0] - count
+        if rows is not None:
+            rows = F.pad(rows, (0, missing))
+        elif share is not None:
+            share = F.pad(share, (0, 0, 0, missing))
+        layers = [(cast(Tensor, flat[i]), flat[i + 1]) for i in range(0, len(flat), 2)]
+        out, ctx.saved = chain_forward(padded, layers, share, rows)
+        ctx.rows, ctx.count, ctx.width = rows, count, x.shape[1]
         ctx.offsets = 0 if offset is None else offset.shape[0]
-        return hidden.to(x.dtype)
+        return out[:count]
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        rows, *saved = ctx.saved_tensors
-        inputs, weights = saved[: ctx.depth], saved[ctx.depth :]
-        wanted = ctx.needs_input_grad
-        of_layers: list[Tensor | None] = []
+        wanted, count = ctx.needs_input_grad, ctx.count
+        gradient = F.pad(gradient, (0, 0, 0, ctx.saved.rows - count))
+        slopes: list[Tensor] | None = [] if wanted[2] else None
+        of_x, of_layers = chain_backward(ctx.saved, gradient, ctx.width if wanted[3] else 0, slopes)
         of_offset: Tensor | None = None
-        of_x: Tensor | None = None
-        slope = gradient.to(ctx.dtype).contiguous()
-        for place in reversed(range(ctx.depth)):
-            if place + 1 < ctx.depth:
-                # ReLU's output is 0 exactly where its gradient is.
-                slope = torch.ops.aten.threshold_backward(slope, inputs[place + 1], 0)
-            of_weight = (slope.t() @ inputs[place]).float() if wanted[4 + 2 * place] else None
-            of_bias = slope.sum(0, dtype=torch.float32) if wanted[5 + 2 * place] else None
-            of_layers = [of_weight, of_bias, *of_layers]
-            if place > 0:
-                slope = _product(slope, weights[place].t(), None, False)
-        if wanted[2]:
-            of_offset = slope.float()
-            if rows is not None:
-                of_offset = torch.zeros(ctx.offsets, slope.shape[1]).index_add_(0, rows, of_offset)
-        if wanted[3]:
-            of_x = _product(slope, weights[0].t(), None, False).float()
-        return (None, None, of_offset, of_x, *of_layers)
+        if slopes is not None:
+            of_offset = torch.cat(slopes)[:count].float()
+            if ctx.rows is not None:
+                into = torch.zeros(ctx.offsets, of_offset.shape[1])
+                of_offset = into.index_add_(0, ctx.rows[:count], of_offset)
+        flat = [tensor for pair in of_layers for tensor in pair]
+        kept = (g if need else None for g, need in zip(flat, wanted[4:], strict=True))
+        return (None, None, of_offset, of_x[:count].float() if wanted[3] else None, *kept)
+
+
+def check_layers(layers: Sequence[Layer | tuple[Tensor, Tensor | None]], width: int) -> int:
+    """Width of what the last layer returns.
+
+    Raises:
+        InputError: if there are none, or shapes do not fit inputs of ``width``.
+    """
+    if not layers:
+        raise InputError("layers: found none, expected at least one")
+    for place, (weight, bias) in enumerate(layers):
+        if weight.dim() != 2 or weight.shape[1] != width:
+            raise InputError(
+                f"layers[{place}]: found a weight {tuple(weight.shape)}, expected (out, {width})"
+            )
+        width = weight.shape[0]
+        if bias is not None and tuple(bias.shape) != (width,):
+            raise InputError(f"layers[{place}]: found a bias {tuple(bias.shape)}, expected ({width},)")
+    return width
 
 
 def mlp(
@@ -155,20 +165,10 @@ def mlp(
         >>> mlp(torch.tensor([[2.0], [-3.0]]), layer, precision="float32").tolist()
         [[3.0], [4.0]]
     """
-    if precision not in _PRECISIONS:
-        raise InputError(f"precision: found {precision!r}, expected one of {', '.join(_PRECISIONS)}")
-    if not layers:
-        raise InputError("layers: found none, expected at least one")
-    width = x.shape[-1]
-    for place, (weight, bias) in enumerate(layers):
-        if x.dim() != 2 or weight.dim() != 2 or weight.shape[1] != width:
-            found = tuple(weight.shape)
-            raise InputError(
-                f"layers[{place}]: found a weight {found}, expected (out, {width}) for x {tuple(x.shape)}"
-            )
-        width = weight.shape[0]
-        if bias is not None and tuple(bias.shape) != (width,):
-            raise InputError(f"layers[{place}]: found a bias {tuple(bias.shape)}, expected ({width},)")
+    check_precision(precision)
+    if x.dim() != 2:
+        raise InputError(f"x: found shape {tuple(x.shape)}, expected (N, in)")
+    check_layers(layers, x.shape[1])
     if offset is not None:
         expected = ("R" if rows is not None else x.shape[0], layers[0][0].shape[0])
         if (
@@ -182,9 +182,7 @@ def mlp(
     flat = [tensor for layer in layers for tensor in layer]
     given = [tensor for tensor in (x, offset, *flat) if tensor is not None]
     if takes_compiled(*given):
-        low = precision == "bfloat16" or (precision == "auto" and bfloat16_is_fast())
-        dtype = torch.bfloat16 if low else torch.float32
-        result: Tensor = _MLP.apply(dtype, rows, offset, x, *flat)  # type: ignore[no-untyped-call]
+        result: Tensor = _MLP.apply(product_dtype(precision), rows, offset, x, *flat)  # type: ignore[no-untyped-call]
         return result
     hidden = x
     for place, (weight, bias) in enumerate(layers):

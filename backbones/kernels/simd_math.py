@@ -8,7 +8,7 @@ from typing import Any
 from llvmlite import ir  # type: ignore[import-untyped]
 from numba.extending import intrinsic
 
-__all__ = ["TINY", "divide", "flush", "magnitude", "sign", "square_root"]
+__all__ = ["TINY", "divide", "flush", "gate", "magnitude", "sign", "square_root"]
 
 # No moment of an optimizer matters below, and subnormal numbers are slow on some processors.
 TINY = 1e-30
@@ -86,3 +86,14 @@ def flush(context: Any, value: Any) -> Any:
         return builder.select(small, _constant(x.type, 0.0), x)
 
     return value(value), generate
+
+
+@_intrinsic
+def gate(context: Any, slope: Any, value: Any) -> Any:
+    """``gate(slope, value)``: ``slope`` where ``value`` is positive, else 0: the gradient of a ReLU."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        zero = _constant(arguments[1].type, 0.0)
+        return builder.select(builder.fcmp_ordered(">", arguments[1], zero), arguments[0], zero)
+
+    return slope(slope, value), generate

@@ -1,0 +1,187 @@
+"""Products of a perceptron in chunks of few sizes.
+
+oneDNN prepares each product for its shape: it takes milliseconds and megabytes, and a march finds another number of
+samples in every iteration. So rows are padded to a multiple of `CHUNK_TAIL` and multiplied in chunks of `CHUNK`, of
+which only the last is smaller. Chunks also stay in the cache from one layer to the next.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from backbones.kernels.bfloat16 import load_low, store_low
+from backbones.kernels.compiler import float32, inline, kernel, matrix, next_task, uint16
+from backbones.kernels.simd import LANES, load, one, store, wide
+from backbones.kernels.simd_math import gate
+from backbones.kernels.threading import launch
+
+__all__ = ["CHUNK", "CHUNK_TAIL", "Chain", "chain_backward", "chain_forward", "padded_rows", "product"]
+
+CHUNK = 4096
+CHUNK_TAIL = 512
+# Rows of one task, and of one entry of the sums over rows.
+_ROWS = 128
+
+
+def padded_rows(count: int) -> int:
+    """``count`` rounded up to what is multiplied."""
+    return -(-count // CHUNK_TAIL) * CHUNK_TAIL
+
+
+def chunks(rows: int) -> Iterator[slice]:
+    """Parts of padded rows."""
+    for start in range(0, rows, CHUNK):
+        yield slice(start, min(start + CHUNK, rows))
+
+
+def product(x: Tensor, weight: Tensor, bias: Tensor | None, relu: bool) -> Tensor:
+    """``x weight^T + bias``, then ReLU if wanted.
+
+    By oneDNN if it can be had: MKL takes twice as long for results whose rows are not a multiple of 16 wide.
+    """
+    fused = getattr(torch.ops.mkldnn, "_linear_pointwise", None)
+    if fused is not None and torch._C._has_mkldnn and x.numel() and weight.numel():
+        found: Tensor = fused(x, weight, bias, "relu" if relu else "none", [], "")
+        return found
+    found = F.linear(x, weight, bias)
+    return found.relu_() if relu else found
+
+
+@inline
+def _gate_step(slope: Any, hidden: Any, sums: Any, i: Any, zero: Any) -> None:
+    passed = gate(load_low(slope, i, zero), load_low(hidden, i, zero))
+    store_low(slope, i, passed)
+    store(sums, i, load(sums, i, zero) + passed)
+
+
+@kernel
+def _gate(table: Any) -> None:
+    """Gradient and value ``(M, C)`` of a ReLU's output in bfloat16, sums ``(tasks, C)``: gate, and sum over rows."""
+    slope, hidden, sums = matrix(table, 0, uint16), matrix(table, 1, uint16), matrix(table, 2, float32)
+    width = slope.shape[1]
+    split = width - width % LANES
+    while True:
+        task = next_task(table)
+        if task < 0:
+            break
+        total = sums[task]
+        for i in range(width):
+            total[i] = float32(0)
+        for n in range(task * _ROWS, min((task + 1) * _ROWS, slope.shape[0])):
+            row, value = slope[n], hidden[n]
+            for i in range(0, split, LANES):
+                _gate_step(row, value, total, i, wide())
+            for i in range(split, width):
+                _gate_step(row, value, total, i, one())
+
+
+@dataclass(frozen=True)
+class Chain:
+    """What a backward pass needs.
+
+    Args:
+        x: ``(M, in)`` input.
+        weights: of each layer, in the input's precision.
+        hidden: of each layer but the last, its output by chunk.
+    """
+
+    x: Tensor
+    weights: list[Tensor]
+    hidden: list[list[Tensor]]
+
+    @property
+    def rows(self) -> int:
+        """M."""
+        return int(self.x.shape[0])
+
+
+def _gated(slope: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
+    """The gradient before a ReLU, from that behind it and from its output; and its sum over rows."""
+    if slope.dtype == torch.bfloat16:
+        slope = slope.contiguous()
+        tasks = -(-slope.shape[0] // _ROWS)
+        sums = torch.empty(tasks, slope.shape[1])
+        launch(_gate, tasks, slope, hidden, sums)
+        return slope, sums.sum(0)
+    # ReLU's output is 0 exactly where its gradient is.
+    slope = torch.ops.aten.threshold_backward(slope, hidden, 0)
+    return slope, slope.sum(0)
+
+
+def chain_forward(
+    x: Tensor,
+    layers: Sequence[tuple[Tensor, Tensor | None]],
+    offset: Tensor | None = None,
+    rows: Tensor | None = None,
+) -> tuple[Tensor, Chain]:
+    """Linear layers with ReLU between them.
+
+    Args:
+        x: ``(M, in)``, M padded (`padded_rows`); its precision is that of the products.
+        layers: float32 weights ``(out, in)`` and biases.
+        offset: added to the first layer's output: ``(M, out)``, or ``(R, out)`` with ``rows (M,)``.
+
+    Returns:
+        ``(M, out)`` float32 and what the backward pass needs.
+    """
+    weights = [weight.to(x.dtype).contiguous() for weight, _ in layers]
+    biases = [None if bias is None else bias.to(x.dtype) for _, bias in layers]
+    hidden: list[list[Tensor]] = [[] for _ in layers[1:]]
+    out = torch.empty(x.shape[0], weights[-1].shape[0])
+    for part in chunks(x.shape[0]):
+        value = x[part]
+        for place, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
+            relu = place + 1 < len(weights)
+            if place == 0 and offset is not None:
+                value = product(value, weight, bias, False)
+                value += offset[part] if rows is None else offset.index_select(0, rows[part])
+                value = value.relu_() if relu else value
+            else:
+                value = product(value, weight, bias, relu)
+            if relu:
+                hidden[place].append(value)
+        out[part] = value
+    return out, Chain(x, weights, hidden)
+
+
+def chain_backward(
+    saved: Chain, gradient: Tensor, columns: int, of_first: list[Tensor] | None = None
+) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:
+    """Gradients of `chain_forward`.
+
+    Args:
+        saved: what it returned.
+        gradient: ``(M, out)`` float32, 0 in the padding.
+        columns: how many columns of the input's gradient are wanted, from the first on.
+        of_first: if given, the gradient of the first layer's output is appended, by chunk.
+
+    Returns:
+        Gradients of the input, ``(M, columns)`` in its precision, and of each layer's weight and bias, float32.
+    """
+    depth, dtype = len(saved.weights), saved.x.dtype
+    of_weights = [torch.zeros(weight.shape) for weight in saved.weights]
+    of_biases = [torch.zeros(weight.shape[0]) for weight in saved.weights]
+    of_x = torch.empty(saved.rows, columns, dtype=dtype)
+    # Transposed once: oneDNN is slow by orders of magnitude on some weights that are views.
+    back = [weight.t().contiguous() for weight in saved.weights]
+    back[0] = back[0][:columns]
+    for number, part in enumerate(chunks(saved.rows)):
+        slope = gradient[part].to(dtype)
+        of_biases[-1] += gradient[part].sum(0)
+        for place in reversed(range(depth)):
+            read = saved.x[part] if place == 0 else saved.hidden[place - 1][number]
+            of_weights[place] += slope.t() @ read
+            if place > 0:
+                slope, total = _gated(product(slope, back[place], None, False), read)
+                of_biases[place - 1] += total
+        if of_first is not None:
+            of_first.append(slope)
+        if columns:
+            of_x[part] = product(slope, back[0], None, False)
+    return of_x, list(zip(of_weights, of_biases, strict=True))
