@@ -7,6 +7,7 @@ from gridreg.export.compare import MeshComparison, compare_meshes
 from gridreg.export.mesh import Mesh, extract_mesh, read_mesh, save_mesh, write_mesh
 from gridreg.export.model import Model
 from gridreg.export.pictures import MODES, picture
+from gridreg.export.runs import LiveView, draw_run, film_path, live_view, model_of_run, model_of_trainer
 from gridreg.export.video import render_frames, render_video
 from gridreg.export.viewer import Viewer
 
@@ -15,6 +16,7 @@ __all__ = [
     "MODES",
     "Camera",
     "Lens",
+    "LiveView",
     "Mesh",
     "MeshComparison",
     "Model",
@@ -22,9 +24,14 @@ __all__ = [
     "Viewer",
     "camera_path",
     "compare_meshes",
+    "draw_run",
     "extract_mesh",
+    "film_path",
+    "live_view",
     "load_cameras",
     "look_at",
+    "model_of_run",
+    "model_of_trainer",
     "orbit_of_box",
     "orbit_of_views",
     "picture",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import math
 import socket
 from collections.abc import Iterator
@@ -19,7 +20,7 @@ from gridreg.errors import InputError
 from gridreg.export.cameras import Camera, Lens
 from gridreg.scenes import Views
 
-__all__ = ["add_frustums", "camera_of", "picture_shape", "quiet_console", "start_server"]
+__all__ = ["add_frustums", "camera_of", "check_address", "picture_shape", "quiet_console", "start_server"]
 
 # The browser's cameras look along +z with y down (OpenCV).
 _FLIP = np.diag([1.0, -1.0, -1.0])
@@ -39,16 +40,14 @@ def quiet_console() -> Iterator[None]:
         console.quiet = before
 
 
-def start_server(host: str, port: int) -> Any:
-    """A ``viser.ViserServer`` on exactly this port (0: any free one).
+def check_address(host: str, port: int) -> int:
+    """The port to listen on (0: a free one), if a viewer could listen there now.
 
     Raises:
         InputError: without viser, if the port is taken, or if the host is none of this machine's.
     """
-    try:
-        import viser
-    except ImportError as error:
-        raise InputError("viewer: viser is not installed, expected: pip install 'gridreg[viewer]'") from error
+    if importlib.util.find_spec("viser") is None:
+        raise InputError("viewer: viser is not installed, expected: pip install 'gridreg[viewer]'")
     if not 0 <= port <= 65535:
         raise InputError(f"port={port}: expected a number from 0 to 65535")
     # viser would silently take the next free port.
@@ -56,12 +55,23 @@ def start_server(host: str, port: int) -> Any:
         try:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind((host, port))
-            port = probe.getsockname()[1]
+            return int(probe.getsockname()[1])
         except OSError as error:
             reason = error.strerror or str(error)
             raise InputError(
                 f"viewer: cannot listen on {host}:{port}: {reason}; choose another port"
             ) from error
+
+
+def start_server(host: str, port: int) -> Any:
+    """A ``viser.ViserServer`` on exactly this port (0: any free one).
+
+    Raises:
+        InputError: as `check_address`.
+    """
+    port = check_address(host, port)
+    import viser
+
     with quiet_console():
         server = viser.ViserServer(host=host, port=port, label="gridreg", verbose=False)
     if server.get_port() != port:

@@ -117,10 +117,15 @@ class Viewer:
         with quiet_console():
             self._server.stop()
 
-    def wait(self) -> None:
-        """Stay until Ctrl-C."""
+    @property
+    def watched(self) -> bool:
+        """Whether a browser shows the page."""
+        return bool(self._screens)
+
+    def wait(self, *, watched: bool = False) -> None:
+        """Stay until Ctrl-C; with ``watched`` only as long as a browser shows the page."""
         with contextlib.suppress(KeyboardInterrupt):
-            while self._thread.is_alive():
+            while self._thread.is_alive() and (self.watched or not watched):
                 self._thread.join(timeout=0.5)
 
     def __enter__(self) -> Viewer:

@@ -10,7 +10,7 @@ from gridreg.scenes.builtin import (
     builtin_surface,
 )
 from gridreg.scenes.llff import ndc_rays
-from gridreg.scenes.load import load_scene
+from gridreg.scenes.load import default_protocol, load_scene
 from gridreg.scenes.prepare import Prepared, prepare
 from gridreg.scenes.protocols import PROTOCOLS, Protocol, get_protocol
 from gridreg.scenes.views import Scene, Views, background_colour
@@ -27,6 +27,7 @@ __all__ = [
     "builtin_scene",
     "builtin_signed_distance",
     "builtin_surface",
+    "default_protocol",
     "get_protocol",
     "load_scene",
     "ndc_rays",

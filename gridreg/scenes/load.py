@@ -21,7 +21,7 @@ from gridreg.scenes.reader import ViewReader
 from gridreg.scenes.transforms import read_transforms
 from gridreg.scenes.views import Scene, Views, background_colour
 
-__all__ = ["BUILTIN_MARKER", "NotASceneError", "load_scene", "read_folder"]
+__all__ = ["BUILTIN_MARKER", "NotASceneError", "default_protocol", "load_scene", "read_folder"]
 
 BUILTIN_MARKER = "builtin.json"
 """File that marks a folder as the built-in scene."""
@@ -97,6 +97,18 @@ def load_scene(
     )
     check_box(scene, files.points if bounds is not None else None)
     return scene
+
+
+def default_protocol(folder: str | Path) -> str:
+    """The protocol that a folder is loaded under when none is named, by its format.
+
+    ``builtin8`` for the built-in scene, ``dietnerf8`` for Blender's two lists of frames, and ``holdout8`` for one list,
+    of which every eighth is held out.
+    """
+    if (Path(folder) / BUILTIN_MARKER).is_file():
+        return "builtin8"
+    one_list = not (Path(folder) / "transforms_train.json").is_file() and Path(folder).is_dir()
+    return "holdout8" if one_list else "dietnerf8"
 
 
 class NotASceneError(InputError):

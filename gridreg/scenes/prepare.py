@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -62,6 +62,9 @@ def prepare(
     out: str | Path,
     *,
     masks: str | Path | None = None,
+    near: float | None = None,
+    far: float | None = None,
+    bounds: Sequence[Sequence[float]] | None = None,
     progress: Callable[[str], None] = lambda stage: None,
 ) -> Prepared:
     """Make a scene folder: upright pictures, ``transforms.json``, and a drawing of the cameras and the box.
@@ -76,11 +79,15 @@ def prepare(
         out: the scene folder to make; must not exist.
         masks: folder with a mask for every picture (white is kept), which becomes its alpha: called like the
             picture, with the extension ``.png`` instead of its own or after it.
+        near: distance from a camera where looking begins, world units of the made scene, instead of the derived one.
+        far: distance from a camera where looking ends, likewise.
+        bounds: ``(2, 3)`` lower and upper corner, likewise; the world stays turned, centred and scaled as derived.
         progress: called with the name of each stage.
 
     Raises:
         InputError: for no, damaged or differently sized pictures, too few that could be registered, pycolmap
-            missing, a mask missing, or a folder ``out`` that exists or cannot be written.
+            missing, a mask missing, near, far or box that hold nothing, or a folder ``out`` that exists or
+            cannot be written.
     """
     source, out = Path(source), Path(out)
     if not source.is_dir():
@@ -97,7 +104,9 @@ def prepare(
         if masks is not None:
             frames = attach_masks(frames, Path(masks), scene)
         progress("box")
-        frames, extent = _write(frames, points, scene)
+        frames, extent = _write(
+            frames, points, scene, lambda derived: _overridden(derived, near, far, bounds)
+        )
         scene.rename(out)
     except OSError as error:
         raise InputError(f"{out}: cannot be written ({error.strerror or error})") from None
@@ -125,7 +134,21 @@ def _gather(
     return frames, files.points, [Path(frame.file_path).name for frame in frames]
 
 
-def _write(frames: list[Frame], points: Array | None, scene: Path) -> tuple[list[Frame], Extent]:
+def _overridden(
+    extent: Extent, near: float | None, far: float | None, bounds: Sequence[Sequence[float]] | None
+) -> Extent:
+    box = extent.bounds if bounds is None else np.array(bounds, dtype=np.float64)
+    wanted = Extent(extent.near if near is None else near, extent.far if far is None else far, box)
+    if not 0 <= wanted.near < wanted.far < np.inf:
+        raise InputError(f"near, far: found {wanted.near:g} and {wanted.far:g}, expected 0 <= near < far")
+    if box.shape != (2, 3) or not np.isfinite(box).all() or not (box[0] < box[1]).all():
+        raise InputError(f"box: found {box.tolist()}, expected (2, 3) with lower corner below upper")
+    return wanted
+
+
+def _write(
+    frames: list[Frame], points: Array | None, scene: Path, override: Callable[[Extent], Extent]
+) -> tuple[list[Frame], Extent]:
     """Write ``transforms.json`` and ``cameras.png`` in normalised coordinates."""
     with Image.open(scene / frames[0].file_path) as image:
         size = image.size
@@ -142,7 +165,7 @@ def _write(frames: list[Frame], points: Array | None, scene: Path) -> tuple[list
     centre = extent.bounds.mean(axis=0)
     scale = _HALF_EDGE / float((extent.bounds[1] - centre).max())
     poses[:, :3, 3] = scale * (poses[:, :3, 3] - centre)
-    extent = Extent(scale * extent.near, scale * extent.far, scale * (extent.bounds - centre))
+    extent = override(Extent(scale * extent.near, scale * extent.far, scale * (extent.bounds - centre)))
     frames = [replace(frame, pose=pose) for frame, pose in zip(frames, poses, strict=True)]
     content = {EXTENT_KEY: {"near": extent.near, "far": extent.far, "bounds": extent.bounds.tolist()}}
     cameras = [_camera_keys(frame.camera, size) for frame in frames]

@@ -1,6 +1,6 @@
 """The training loop and what it leaves behind: checkpoints, metrics, renders, curves."""
 
-from gridreg.training.execute import Execution, execute
+from gridreg.training.execute import Execution, Watch, execute
 from gridreg.training.options import TrainOptions, configure, output_folder
 from gridreg.training.presets import load_preset, preset_names
 from gridreg.training.run import (
@@ -23,6 +23,7 @@ __all__ = [
     "TrainOptions",
     "TrainSettings",
     "Trainer",
+    "Watch",
     "build_trainer",
     "configure",
     "execute",

@@ -7,7 +7,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 
@@ -18,13 +18,25 @@ from gridreg.training.config import save_yaml, to_data
 from gridreg.training.curves import History, draw_curves, draw_masks
 from gridreg.training.evaluate import Scored, mean_psnr_of, score_views
 from gridreg.training.files import check_output_folder
-from gridreg.training.outputs import metrics_record, save_contact_sheet, save_metrics, save_view
+from gridreg.training.outputs import metrics_record, save_contact_sheet, save_metrics, save_scored
 from gridreg.training.progress import Interruption, Progress, interruptible
 from gridreg.training.run import build_trainer, resume_trainer, save_run
 from gridreg.training.settings import RunConfig
 from gridreg.training.trainer import StepReport, Trainer
 
-__all__ = ["Execution", "execute"]
+__all__ = ["Execution", "Watch", "execute"]
+
+
+class Watch(Protocol):
+    """Somebody who looks on while a run is under way, such as `gridreg.export.LiveView`."""
+
+    def start(self, run: Execution, /) -> None:
+        """Called once, before the first iteration and before anything is written."""
+        ...
+
+    def step(self, report: StepReport, /) -> None:
+        """Called after every iteration, in the thread that trains."""
+        ...
 
 
 @dataclass
@@ -136,16 +148,7 @@ class Execution:
         trainer.field.eval()
 
         def each(view: Scored) -> None:
-            picture = view.rendered
-            save_view(
-                folder,
-                view.name,
-                picture.colour,
-                view.target,
-                depth=picture.depth,
-                opacity=picture.opacity,
-                metrics=view.metrics,
-            )
+            save_scored(folder, view)
             done.append(view)
             progress.update(len(done), psnr=view.metrics["psnr"])
             if interruption.requested:
@@ -207,6 +210,7 @@ def execute(
     resume: bool = False,
     command: Sequence[str] = (),
     on_step: Any = None,
+    watch: Watch | None = None,
 ) -> tuple[Execution, dict[str, Any] | None]:
     """Train, score and record one run.
 
@@ -220,6 +224,7 @@ def execute(
         resume: go on from the checkpoint in ``out``.
         command: the command line, for the record.
         on_step: called with the `StepReport` of every iteration.
+        watch: told when the run starts, and of every iteration.
 
     Returns:
         The execution, and the metrics, or None if it was interrupted (its checkpoint is saved).
@@ -242,15 +247,29 @@ def execute(
         trainer, history, times = build_trainer(config, scene), History(max(1, config.train.steps // 200)), {}
     times["setup"] = times.get("setup", 0.0) + time.perf_counter() - began
     run = Execution(config, scene, folder, trainer, history, times)
+    if watch is not None:
+        watch.start(run)
     save_yaml(
         folder / "config.yaml", config, comment="Everything that determines this run; pass it with --config."
     )
     with interruptible() as interruption:
         with Progress(config.train.steps, start=trainer.step) as progress:
-            finished = run.train(progress, interruption, on_step)
+            finished = run.train(progress, interruption, _both(on_step, watch))
         if not finished:
             print(f"stopped at step {trainer.step}; go on with --resume --out {folder}", file=sys.stderr)
             return run, None
         with Progress(len(scene.test), label="test view") as progress:
             scored = run.score(progress, interruption)
     return run, run.record(scored, command)
+
+
+def _both(on_step: Any, watch: Watch | None) -> Any:
+    if watch is None:
+        return on_step
+
+    def each(report: StepReport) -> None:
+        watch.step(report)
+        if on_step is not None:
+            on_step(report)
+
+    return each

@@ -16,39 +16,51 @@ from gridreg.training.settings import RunConfig
 
 __all__ = ["TrainOptions", "configure", "output_folder"]
 
+# In --help without "(default: None)": the text of each option says what holds without it.
+_Folder = Annotated[Path | None, tyro.conf.arg(metavar="DIR", help_behavior_hint="")]
+_File = Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")]
+_Name = Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")]
+_Number = Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="")]
+
 
 @dataclass
 class TrainOptions:
     """Reconstruct a scene from a few pictures with known cameras, score it and save it."""
 
-    scene: Path | None = None
-    """Scene folder in Blender format (transforms_train.json); without one, the built-in scene."""
-    protocol: str | None = None
-    """Which views to train and test on: dietnerf8 (default), gs8, fewtensorf8, human8, human50, views<N>, ..."""
+    scene: _Folder = None
+    """Scene folder (Blender, transforms.json, COLMAP, LLFF); without one, the built-in scene."""
+    protocol: _Name = None
+    """Views by name: dietnerf8 (default for Blender), holdout8 (default for one list), gs8, human8, views<N>, ..."""
     preset: str = "quick"
     """Field, schedule and regularizers by name; `paper` is few_tensorf."""
-    composition: str | None = None
-    """Another named composition of regularizers on the preset's field and schedule."""
-    config: Path | None = None
+    composition: _Name = None
+    """Another named composition of regularizers on the field and schedule; default: the preset's."""
+    config: _File = None
     """YAML file whose values replace the preset's, such as the config.yaml of an earlier run."""
-    backbone: str | None = None
-    """vm, cp or mlp."""
-    out: Path | None = None
+    backbone: _Name = None
+    """Field by name: vm, cp or mlp; default: the preset's."""
+    out: _Folder = None
     """Output folder; default: outputs/SCENE-PRESET, numbered if that holds a run."""
     resume: bool = False
     """Go on from the checkpoint in the output folder."""
-    steps: int | None = None
-    """Iterations; the schedule's events move in proportion."""
-    seed: int | None = None
-    """Of every random number."""
-    threads: int | None = None
+    steps: _Number = None
+    """Iterations; the schedule's events move in proportion; default: the preset's."""
+    seed: _Number = None
+    """Of every random number; default: 0."""
+    threads: _Number = None
     """Processor threads; default: all cores. Results are the same for the same number."""
-    set: Annotated[tuple[str, ...], tyro.conf.arg(metavar="KEY=VALUE")] = ()
+    set: Annotated[tuple[str, ...], tyro.conf.arg(metavar="KEY=VALUE", help_behavior_hint="")] = ()
     """Any other value of the configuration, such as train.rays=2048."""
     mesh: bool = True
     """Write mesh.ply."""
     video: bool = True
-    """Write turntable.mp4."""
+    """Write turntable.mp4 (a forward-facing scene: spiral.mp4)."""
+    view: bool = False
+    """Show the field in the browser while it is trained (extra `viewer`)."""
+    host: str = "127.0.0.1"
+    """Address that the viewer listens on; the default is reached from this machine only."""
+    port: int = 8080
+    """Port that the viewer listens on; 0: any free one."""
 
 
 def configure(options: TrainOptions) -> RunConfig:

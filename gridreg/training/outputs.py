@@ -12,6 +12,7 @@ import numpy as np
 from torch import Tensor
 
 from gridreg.errors import InputError
+from gridreg.training.evaluate import Scored
 from gridreg.training.files import write_json
 from gridreg.training.metrics import json_ready, mean_metrics
 from gridreg.training.pictures import (
@@ -34,7 +35,9 @@ __all__ = [
     "metrics_record",
     "save_contact_sheet",
     "save_metrics",
+    "save_scored",
     "save_view",
+    "summary",
 ]
 
 MAX_ERROR = 0.5
@@ -156,6 +159,24 @@ def save_view(
         save_png(place / f"{name}_depth.png", depth_picture(depth, opacity))
 
 
+def save_scored(folder: str | os.PathLike[str], view: Scored) -> None:
+    """``save_view`` of a view that `gridreg.training.evaluate.score_views` has scored.
+
+    Raises:
+        InputError: if the place is not writable.
+    """
+    picture = view.rendered
+    save_view(
+        folder,
+        view.name,
+        picture.colour,
+        view.target,
+        depth=picture.depth,
+        opacity=picture.opacity,
+        metrics=view.metrics,
+    )
+
+
 def save_contact_sheet(
     path: str | os.PathLike[str],
     names: Sequence[str],
@@ -264,6 +285,16 @@ def save_metrics(path: str | os.PathLike[str], record: Mapping[str, Any]) -> Non
         InputError: if the place is not writable or the disk is full.
     """
     write_json(path, record)
+
+
+def summary(record: Mapping[str, Any]) -> str:
+    """The mean of ``metrics_record`` in one line, with what it is the mean of."""
+    mean = record["mean"]
+    views = record["test_views"]
+    return (
+        f"{record['scene']}, {record['protocol']}: mean of {views} test view{'s' if views != 1 else ''}: "
+        f"PSNR {mean['psnr']:.2f} dB, SSIM {mean['ssim_gaussian']:.4f} (11x11 Gaussian)"
+    )
 
 
 def _error(image: Tensor, target: Tensor) -> np.ndarray[Any, np.dtype[np.float64]]:

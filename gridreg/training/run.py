@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from gridreg.errors import InputError
 from gridreg.fields import make_field
 from gridreg.handle import Handle
 from gridreg.rendering import March, OccupancyGrid
-from gridreg.scenes import Scene, builtin_scene, load_scene
+from gridreg.scenes import Scene, builtin_scene, default_protocol, load_scene
 from gridreg.training import events
 from gridreg.training.checkpoint import has_checkpoint, load_checkpoint, save_checkpoint
 from gridreg.training.config import from_data, to_data
@@ -33,17 +34,19 @@ __all__ = [
 ]
 
 
-def open_scene(config: RunConfig, cache: Path, validation: int | None = None) -> Scene:
+def open_scene(
+    config: RunConfig, cache: Path, validation: int | None = None, *, test: Sequence[int] | None = None
+) -> Scene:
     """The scene of a configuration; without one, the built-in scene, made in ``cache`` if it is not there.
 
     Args:
         config: names scene and protocol.
         cache: folder for the built-in scene.
         validation: how many views to read for tuning, outside the protocol's.
+        test: indices of the test views instead of the protocol's; an empty one reads none.
     """
-    if config.scene is None:
-        return load_scene(builtin_scene(cache), config.protocol or "builtin8", validation=validation)
-    return load_scene(config.scene, config.protocol or "dietnerf8", validation=validation)
+    folder = builtin_scene(cache) if config.scene is None else Path(config.scene)
+    return load_scene(folder, config.protocol or default_protocol(folder), test=test, validation=validation)
 
 
 def regularizers_of(config: RunConfig) -> list[Regularizer]:

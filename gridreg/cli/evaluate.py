@@ -1,0 +1,90 @@
+"""``gridreg eval``: the score of a checkpoint, computed again."""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import dataclass
+
+from gridreg.cli.arguments import Checkpoint, OptionalFolder
+
+__all__ = ["EvalOptions", "run"]
+
+
+@dataclass
+class EvalOptions:
+    """Score a checkpoint on the test views of its scene; another scene is refused."""
+
+    checkpoint: Checkpoint
+    """Output folder of a run, or its checkpoint."""
+    scene: OptionalFolder = None
+    """Where the scene lies now; default: where the run found it."""
+    out: OptionalFolder = None
+    """Folder for metrics.json, test.png and test/ (renders beside their targets); default: print the score only."""
+
+
+def run(options: EvalOptions) -> int:
+    """Print the score of each test view and their mean.
+
+    Raises:
+        InputError: for a missing or damaged checkpoint, another scene, or a place that is not writable.
+    """
+    from gridreg.cli.runs import scene_of
+    from gridreg.training import load_run
+    from gridreg.training.config import to_data
+    from gridreg.training.evaluate import Scored, score_views
+    from gridreg.training.files import check_output_folder
+    from gridreg.training.outputs import (
+        metrics_record,
+        save_contact_sheet,
+        save_metrics,
+        save_scored,
+        summary,
+    )
+
+    loaded = load_run(options.checkpoint)
+    scene = scene_of(loaded, options.checkpoint, options.scene)
+    folder = None if options.out is None else check_output_folder(options.out / "test")
+    if loaded.step < loaded.config.train.steps:
+        print(f"step {loaded.step} of {loaded.config.train.steps}: not trained to its end", file=sys.stderr)
+    began = time.perf_counter()
+
+    def each(view: Scored) -> None:
+        values = "  ".join(f"{name} {value:.4f}" for name, value in view.metrics.items())
+        print(f"{view.name}  {values}", flush=True)
+        if folder is not None:
+            save_scored(folder, view)
+
+    scored = score_views(
+        loaded.field,
+        scene.test,
+        loaded.occupancy,
+        loaded.march,
+        loaded.background,
+        each,
+        warp=loaded.warp,
+    )
+    record = metrics_record(
+        {view.name: view.metrics for view in scored},
+        scene=scene.name,
+        protocol=scene.protocol,
+        builtin=scene.builtin,
+        seed=loaded.config.seed,
+        steps=loaded.step,
+        seconds={"test": time.perf_counter() - began},
+        config=to_data(loaded.config),
+        command=["gridreg", *sys.argv[1:]],
+        train_views=scene.train.names,
+        uses_alpha=loaded.config.train.carve,
+    )
+    if options.out is not None:
+        save_metrics(options.out / "metrics.json", record)
+        save_contact_sheet(
+            options.out / "test.png",
+            [view.name for view in scored],
+            [view.rendered.colour for view in scored],
+            [view.target for view in scored],
+            psnrs=[view.metrics["psnr"] for view in scored],
+        )
+    print(summary(record))
+    return 0

@@ -1,0 +1,140 @@
+"""``gridreg COMMAND ...``: finds the command and loads nothing but what it needs.
+
+Each command is a module with a dataclass of options, which tyro turns into ``--help``, and a function ``run``.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import metadata
+from typing import Annotated, Any, Union
+
+from gridreg.cli.ending import ending
+from gridreg.errors import InputError
+
+__all__ = ["COMMANDS", "Command", "main", "options_of"]
+
+
+@dataclass(frozen=True)
+class Command:
+    """Where a command lives.
+
+    Args:
+        about: one line for the overview.
+        options: ``module:class`` of its options.
+        run: ``module:function`` that takes them and returns the exit status.
+    """
+
+    about: str
+    options: str
+    run: str
+
+
+def _own(about: str, module: str, options: str) -> Command:
+    return Command(about, f"gridreg.cli.{module}:{options}", f"gridreg.cli.{module}:run")
+
+
+COMMANDS: dict[str, Command] = {
+    "prepare": _own("turn a folder of pictures into a scene", "prepare", "PrepareOptions"),
+    "train": Command(
+        "reconstruct a scene, score it, and write a mesh and a film",
+        "gridreg.training.options:TrainOptions",
+        "gridreg.cli.train:run",
+    ),
+    "eval": _own("score a checkpoint again", "evaluate", "EvalOptions"),
+    "view": _own("look at a checkpoint in the browser", "view", "ViewOptions"),
+    "render": _own("film one checkpoint, or several side by side", "render", "RenderOptions"),
+    "mesh": _own("cut a mesh out of a checkpoint", "mesh", "MeshOptions"),
+    "compare-mesh": _own("measure a mesh against the true one", "compare_mesh", "CompareMeshOptions"),
+    "ablate": Command(
+        "compare compositions of regularizers over scenes and seeds",
+        "gridreg.ablation.command:AblationOptions",
+        "gridreg.ablation.command:run",
+    ),
+    "bench": _own("run a benchmark of a checkout", "bench", "BenchOptions"),
+}
+"""The commands by name, in the order of the overview."""
+
+_COMPLETION = ("--tyro-print-completion", "--tyro-write-completion")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit status.
+
+    Args:
+        argv: the words after the program's name; None: those of this process.
+    """
+    words = list(sys.argv[1:] if argv is None else argv)
+    return ending(lambda: _main(words))
+
+
+def _main(words: list[str]) -> int:
+    if not words or words[0] in ("-h", "--help", "help"):
+        print(overview())
+        return 0
+    if words[0] in ("-V", "--version"):
+        print(f"gridreg {metadata.version('gridreg')}")
+        return 0
+    if words[0] in _COMPLETION:
+        return _completion(words)
+    name, rest = words[0], words[1:]
+    if name not in COMMANDS:
+        near = difflib.get_close_matches(name, COMMANDS, n=1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        raise InputError(f"command: found {name!r}, expected one of {', '.join(COMMANDS)}{hint}")
+    run = _load(COMMANDS[name].run)
+    if name == "bench":
+        # What follows the name of a benchmark is the benchmark's own.
+        return int(run(rest))
+    import tyro
+
+    return int(run(tyro.cli(options_of(name), args=rest, prog=f"gridreg {name}")) or 0)
+
+
+def options_of(name: str) -> Any:
+    """The dataclass of a command's options."""
+    return _load(COMMANDS[name].options)
+
+
+def overview() -> str:
+    """What ``gridreg --help`` prints."""
+    width = max(map(len, COMMANDS))
+    lines = [f"  {name:<{width}}  {command.about}" for name, command in COMMANDS.items()]
+    return "\n".join(
+        [
+            "usage: gridreg COMMAND [OPTIONS]",
+            "",
+            "From a few pictures to a radiance field, a mesh, a film, and an honest score.",
+            "",
+            *lines,
+            "",
+            "gridreg COMMAND --help    options with units and defaults",
+            "gridreg --version",
+            "gridreg --tyro-print-completion bash|zsh|tcsh    completion for a shell, to be sourced",
+            "",
+            "From pictures of your own:",
+            "  gridreg prepare PICTURES SCENE",
+            "  gridreg train --scene SCENE --out RUN --view",
+            "  gridreg view RUN",
+        ]
+    )
+
+
+def _load(place: str) -> Any:
+    module, _, name = place.partition(":")
+    return getattr(importlib.import_module(module), name)
+
+
+def _completion(words: list[str]) -> int:
+    import tyro
+
+    parts = [
+        Annotated[options_of(name), tyro.conf.subcommand(name, prefix_name=False, description=command.about)]
+        for name, command in COMMANDS.items()
+    ]
+    tyro.cli(Union[tuple(parts)], args=words, prog="gridreg")  # type: ignore[call-overload]  # noqa: UP007
+    return 0

@@ -1,0 +1,63 @@
+"""``gridreg mesh``: the surface of a checkpoint."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from gridreg.cli.arguments import Checkpoint, OptionalFile, OptionalFloat
+
+__all__ = ["MeshOptions", "run"]
+
+
+@dataclass
+class MeshOptions:
+    """Cut a closed, coloured mesh out of a checkpoint's density, in world coordinates."""
+
+    checkpoint: Checkpoint
+    """Output folder of a run, or its checkpoint."""
+    out: OptionalFile = None
+    """File to write: .ply, .obj or .glb; default: mesh.ply in the run's folder."""
+    resolution: int = 256
+    """Lattice nodes along the longest edge of the box; memory grows with the cube, 350 MB at 256."""
+    threshold: OptionalFloat = None
+    """Density at the surface, per world unit; default: follows from the field."""
+    min_component: float = 0.01
+    """Parts with less surface than this share of the largest part's are dropped; 0 keeps all."""
+    colours: bool = True
+    """Colour the vertices as the field is seen along its normals."""
+
+
+def run(options: MeshOptions) -> int:
+    """Write the mesh and say what it is.
+
+    Raises:
+        InputError: for a missing or damaged checkpoint, an empty field, a forward-facing scene, or a place that is not
+            writable.
+    """
+    from gridreg.cli.runs import folder_of
+    from gridreg.errors import InputError
+    from gridreg.export import write_mesh
+    from gridreg.training import load_run
+
+    loaded = load_run(options.checkpoint)
+    if loaded.warp is not None:
+        raise InputError(
+            f"{options.checkpoint}: a forward-facing scene, whose field is not in world coordinates; "
+            "expected one with cameras around it"
+        )
+    target = options.out if options.out is not None else folder_of(options.checkpoint) / "mesh.ply"
+    mesh = write_mesh(
+        loaded.field,
+        target,
+        loaded.occupancy,
+        resolution=options.resolution,
+        threshold=options.threshold,
+        min_component=options.min_component,
+        colours=options.colours,
+    )
+    closed = "watertight" if mesh.watertight else "not watertight"
+    print(
+        f"{target}: {len(mesh.vertices)} vertices, {len(mesh.faces)} faces, {closed}, "
+        f"volume {mesh.volume:.4g} cubic world units, cut at density {mesh.threshold:.4g} per world unit"
+    )
+    return 0

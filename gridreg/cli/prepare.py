@@ -1,0 +1,69 @@
+"""``gridreg prepare``: pictures in, a scene out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from gridreg.cli.arguments import OptionalFloat, OptionalFolder
+
+__all__ = ["PrepareOptions", "run"]
+
+Box = Annotated[
+    tuple[float, float, float, float, float, float] | None,
+    tyro.conf.arg(metavar="X0 Y0 Z0 X1 Y1 Z1", help_behavior_hint=""),
+]
+
+
+@dataclass
+class PrepareOptions:
+    """Turn a folder of pictures (extra `colmap`), or a scene of COLMAP, nerfstudio or instant-ngp, into a scene folder.
+
+    The world is turned so that z is up, centred, and scaled so that the box reaches 1.3 to each side. Look at
+    cameras.png before training; give near, far and box anew where it shows them wrong.
+    """
+
+    pictures: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PICTURES")]
+    """Folder of pictures (.jpg, .png, all of one size), or of a scene with cameras."""
+    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
+    """Scene folder to make; must not exist."""
+    masks: OptionalFolder = None
+    """Folder with a mask for every picture, white where it is kept, called like the picture with .png."""
+    near: OptionalFloat = None
+    """Distance from a camera where looking begins, world units of the made scene; default: from cameras and points."""
+    far: OptionalFloat = None
+    """Distance from a camera where looking ends, likewise."""
+    box: Box = None
+    """Lower and upper corner, world units of the made scene; default: from cameras and points."""
+
+
+def run(options: PrepareOptions) -> int:
+    """Make the scene folder and say what was found.
+
+    Raises:
+        InputError: as `gridreg.scenes.prepare`.
+    """
+    import sys
+
+    from gridreg.scenes import prepare
+
+    box = None if options.box is None else (options.box[:3], options.box[3:])
+
+    def say(stage: str) -> None:
+        print(f"{stage} ...", file=sys.stderr, flush=True)
+
+    made = prepare(
+        options.pictures,
+        options.out,
+        masks=options.masks,
+        near=options.near,
+        far=options.far,
+        bounds=box,
+        progress=say,
+    )
+    print(made)
+    print(f"look at {made.drawing}, then: gridreg train --scene {options.out} --out RUN")
+    return 0

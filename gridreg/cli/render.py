@@ -1,0 +1,88 @@
+"""``gridreg render``: films of checkpoints."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from gridreg.cli.arguments import OptionalFile, OptionalFloat, OptionalFolder, OptionalInt, OptionalText
+
+__all__ = ["RenderOptions", "run"]
+
+
+@dataclass
+class RenderOptions:
+    """Film a checkpoint along a path of cameras; several checkpoints lie side by side in one film."""
+
+    checkpoints: Annotated[
+        tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN [RUN ...]", help_behavior_hint="")
+    ]
+    """Output folders of runs, or their checkpoints; the cameras are those of the first."""
+    out: OptionalFile = None
+    """Film (.mp4, .gif), or a name without suffix for a folder of PNG frames; default: PATH.mp4 in the run's folder."""
+    path: OptionalText = None
+    """turntable (default), spiral (default facing forward), train (through the training cameras), or a JSON file."""
+    modes: tuple[Literal["rgb", "depth", "opacity"], ...] = ("rgb",)
+    """What to show, side by side; depth has a scale in world units."""
+    frames: int = 120
+    """Number of pictures; a camera file has its own."""
+    fps: float = 30.0
+    """Pictures per second."""
+    width: OptionalInt = None
+    """Of each picture, pixels; default: that of the training pictures."""
+    elevation: OptionalFloat = None
+    """Of the turntable, degrees above the horizon; default: the median of the training cameras'."""
+    radius: OptionalFloat = None
+    """Distance of turntable and spiral, world units; default: the median of the training cameras'."""
+    scene: OptionalFolder = None
+    """Where the scene lies now, for its training cameras; default: where the run found it."""
+
+
+def run(options: RenderOptions) -> int:
+    """Write the film and say where.
+
+    Raises:
+        InputError: for missing or damaged checkpoints, bad paths and numbers, or without ffmpeg (MP4).
+    """
+    from gridreg.cli.runs import folder_of, views_scene
+    from gridreg.errors import InputError
+    from gridreg.export import film_path, model_of_run, render_video
+    from gridreg.training import load_run
+    from gridreg.training.progress import Progress
+
+    if not options.checkpoints:
+        raise InputError("checkpoints: found none, expected at least one run")
+    if options.width is not None and options.width < 1:
+        raise InputError(f"--width: found {options.width}, expected at least 1 pixel")
+    runs = [load_run(checkpoint) for checkpoint in options.checkpoints]
+    first = options.checkpoints[0]
+    scene = views_scene(runs[0], first, options.scene)
+    if scene is None:
+        print(f"{runs[0].config.scene}: not there any more, so the path follows the box", file=sys.stderr)
+    models = [model_of_run(run) for run in runs]
+    cameras = film_path(
+        models[0],
+        None if scene is None else scene.train,
+        options.path,
+        frames=options.frames,
+        width=options.width,
+        elevation=options.elevation,
+        radius=options.radius,
+    )
+    name = Path(options.path).stem if options.path else "spiral" if models[0].warp else "turntable"
+    target = options.out if options.out is not None else folder_of(first) / f"{name}.mp4"
+    with Progress(len(cameras), label="frame") as progress:
+        render_video(
+            models,
+            target,
+            cameras,
+            modes=options.modes,
+            fps=options.fps,
+            progress=lambda done, total, left: progress.update(done),
+        )
+    print(f"{target}: {len(cameras)} frames of {cameras[0].lens.width}x{cameras[0].lens.height}")
+    return 0

@@ -1,0 +1,42 @@
+"""``gridreg train``: the example's own way, installed."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from gridreg.export import draw_run, live_view
+from gridreg.training import TrainOptions, configure, execute, open_scene, output_folder
+from gridreg.training.outputs import summary
+
+__all__ = ["run"]
+
+
+def run(options: TrainOptions) -> int:
+    """Train, score, draw; 130 if it was interrupted, with its checkpoint saved.
+
+    Raises:
+        InputError: for anything that a user can mend.
+    """
+    with live_view(options.view, options.host, options.port) as look:
+        config = configure(options)
+        out = output_folder(options, config)
+        scene = open_scene(config, cache=Path("outputs"))
+        print(
+            f"{scene.name}, {scene.protocol}: {len(scene.train)} training and {len(scene.test)} test views of "
+            f"{scene.train.width}x{scene.train.height}; results go to {out}",
+            flush=True,
+        )
+        execution, metrics = execute(
+            config, scene, out, resume=options.resume, command=["gridreg", *sys.argv[1:]], watch=look
+        )
+        if metrics is None:
+            return 130
+        written = draw_run(execution, mesh=options.mesh, video=options.video)
+        print(f"{summary(metrics)}; trained in {metrics['seconds']['train']:.0f} s")
+        for path in [out / "metrics.json", out / "test.png", *written]:
+            print(f"  {path}")
+        sys.stdout.flush()
+        if look is not None:
+            look.finish()
+    return 0

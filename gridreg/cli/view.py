@@ -1,0 +1,50 @@
+"""``gridreg view``: a checkpoint in the browser."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+
+from gridreg.cli.arguments import Checkpoint, OptionalFolder
+
+__all__ = ["ViewOptions", "run"]
+
+
+@dataclass
+class ViewOptions:
+    """Look at a checkpoint in the browser, with its masks at any step (extra `viewer`); Ctrl-C ends it."""
+
+    checkpoint: Checkpoint
+    """Output folder of a run, or its checkpoint."""
+    scene: OptionalFolder = None
+    """Where the scene lies now, for its training cameras; default: where the run found it."""
+    host: str = "127.0.0.1"
+    """Address to listen on; the default is reached from this machine only, 0.0.0.0 from the network."""
+    port: int = 8080
+    """Port to listen on; 0: any free one."""
+    size: int = 512
+    """Longer edge of the picture at rest, pixels."""
+
+
+def run(options: ViewOptions) -> int:
+    """Serve the page until Ctrl-C.
+
+    Raises:
+        InputError: for a missing or damaged checkpoint, without viser, or if the port is taken.
+    """
+    from gridreg.cli.runs import views_scene
+    from gridreg.export import Viewer, model_of_run
+    from gridreg.export.browser import check_address
+    from gridreg.training import load_run
+
+    check_address(options.host, options.port)
+    loaded = load_run(options.checkpoint)
+    scene = views_scene(loaded, options.checkpoint, options.scene)
+    if scene is None:
+        print(f"{loaded.config.scene}: not there any more, so no training cameras", file=sys.stderr)
+    views = None if scene is None else scene.train
+    with Viewer(
+        model_of_run(loaded), views, host=options.host, port=options.port, size=options.size
+    ) as viewer:
+        viewer.wait()
+    return 0

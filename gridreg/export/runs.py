@@ -1,0 +1,156 @@
+"""Runs and what can be held and shown of them: models, a mesh, a film, and a look while they are under way."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gridreg.errors import InputError
+from gridreg.export.browser import check_address
+from gridreg.export.camera_paths import camera_path
+from gridreg.export.cameras import Camera
+from gridreg.export.mesh import write_mesh
+from gridreg.export.model import Model
+from gridreg.export.video import render_video
+from gridreg.export.viewer import Viewer
+from gridreg.scenes import Views
+
+if TYPE_CHECKING:
+    from gridreg.training import Execution, LoadedRun, StepReport, Trainer
+
+__all__ = ["LiveView", "draw_run", "film_path", "live_view", "model_of_run", "model_of_trainer"]
+
+
+def model_of_run(run: LoadedRun) -> Model:
+    """The model of a checkpoint that `gridreg.training.load_run` read."""
+    return Model(run.field, run.occupancy, run.march, run.background, run.handle, run.warp)
+
+
+def model_of_trainer(trainer: Trainer) -> Model:
+    """The model of a field in training; nothing is copied, so it follows the training."""
+    background = trainer.scene.background
+    return Model(trainer.field, trainer.occupancy, trainer.march, background, trainer.handle, trainer.warp)
+
+
+def film_path(
+    model: Model, views: Views | None = None, path: str | Path | None = None, **options: Any
+) -> list[Camera]:
+    """Cameras for a film of a model, as `camera_path` gives them.
+
+    Args:
+        model: what to film.
+        views: the training views.
+        path: name or camera file; None: a turntable, or for a forward-facing scene a spiral.
+        options: further arguments of `camera_path`.
+
+    Raises:
+        InputError: of `camera_path`; for a turntable of a forward-facing scene.
+    """
+    forward = model.warp is not None
+    name = path if path is not None else "spiral" if forward else "turntable"
+    if forward and name == "turntable":
+        raise InputError(
+            "path: found 'turntable', expected spiral or train: a forward-facing scene has no back"
+        )
+    if forward and views is None and name == "spiral":
+        raise InputError("path 'spiral': needs the training cameras of the forward-facing scene")
+    return camera_path(name, model.field.bounds, views, **options)
+
+
+def draw_run(run: Execution, *, mesh: bool = True, video: bool = True) -> list[Path]:
+    """Write ``mesh.ply`` and ``turntable.mp4`` (forward-facing: ``spiral.mp4``) into the folder of a finished run.
+
+    A field without a surface (a very short run) and a forward-facing scene get no mesh; standard error says why.
+
+    Args:
+        run: trained to its end.
+        mesh: write the mesh.
+        video: write the film.
+
+    Returns:
+        What was written.
+
+    Raises:
+        InputError: without ffmpeg, or if the place is not writable.
+    """
+    trainer, written = run.trainer, []
+    model = model_of_trainer(trainer)
+    forward = model.warp is not None
+    if mesh and forward:
+        print("no mesh: the field of a forward-facing scene is not in world coordinates", file=sys.stderr)
+    elif mesh:
+        try:
+            write_mesh(trainer.field, run.out / "mesh.ply", trainer.occupancy)
+            written.append(run.out / "mesh.ply")
+        except InputError as error:
+            print(f"no mesh: {error}", file=sys.stderr)
+    if video:
+        target = run.out / ("spiral.mp4" if forward else "turntable.mp4")
+        render_video(model, target, film_path(model, run.scene.train, frames=60, width=200))
+        written.append(target)
+    return written
+
+
+class LiveView:
+    """A viewer beside a training: pass it to `gridreg.training.execute` as ``watch``.
+
+    Args:
+        host: address to listen on; 127.0.0.1 is reached from this machine alone.
+        port: 0: any free one.
+
+    Raises:
+        InputError: without viser, if the port is taken, or if the host is none of this machine's.
+    """
+
+    def __init__(self, host: str = "127.0.0.1", port: int = 8080) -> None:
+        # Before anything is loaded or written.
+        check_address(host, port)
+        self._host, self._port = host, port
+        self._trainer: Trainer | None = None
+        self.viewer: Viewer | None = None
+
+    def start(self, run: Execution) -> None:
+        """Open the page on the untrained field."""
+        self._trainer = run.trainer
+        self.viewer = Viewer(model_of_trainer(run.trainer), run.scene.train, host=self._host, port=self._port)
+
+    def step(self, report: StepReport) -> None:
+        """Show the field as it is now, if somebody looks and the last copy is old."""
+        if self.viewer is not None and self.viewer.wants_update:
+            self._update()
+
+    def finish(self) -> None:
+        """Show the final field, and stay as long as a browser shows the page."""
+        if self.viewer is not None and self.viewer.watched:
+            self._update()
+            print("done; the page stays until it is closed, or Ctrl-C", file=sys.stderr, flush=True)
+            self.viewer.wait(watched=True)
+
+    def close(self) -> None:
+        """Take the page away."""
+        if self.viewer is not None:
+            self.viewer.close()
+
+    def _update(self) -> None:
+        if self.viewer is not None and self._trainer is not None:
+            self.viewer.update(model_of_trainer(self._trainer))
+
+
+@contextmanager
+def live_view(wanted: bool, host: str = "127.0.0.1", port: int = 8080) -> Iterator[LiveView | None]:
+    """A `LiveView` for the block if it is wanted, else None; at the end of the block the page goes away.
+
+    Raises:
+        InputError: as `LiveView`.
+    """
+    if not wanted:
+        yield None
+        return
+    look = LiveView(host, port)
+    try:
+        yield look
+    finally:
+        look.close()
