@@ -22,7 +22,7 @@ from gridreg.training.config import from_data
 from gridreg.training.files import check_output_folder, output_errors, remove_folder, write_text
 from gridreg.training.versions import cpu_model
 
-__all__ = ["LOG_NAME", "Outcome", "Scenes", "describe_machine", "perform", "reason_of"]
+__all__ = ["LOG_NAME", "Outcome", "Scenes", "describe_machine", "perform", "reason_of", "scene_key"]
 
 LOG_NAME = "log.txt"
 """File in a run's folder with what the run printed, and the traceback of an error."""

@@ -1,0 +1,212 @@
+"""Runs on a Ray cluster: workers share nothing with the store, they get a run and send back the files of its folder."""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import dataclass
+from typing import Any
+
+from gridreg.ablation.claims import Claim, ClaimLostError, Heartbeat
+from gridreg.ablation.packing import pack_folder, unpack_folder
+from gridreg.ablation.perform import Scenes, scene_key
+from gridreg.ablation.processes import usable_cores
+from gridreg.ablation.ray_cluster import connected, import_ray
+from gridreg.ablation.ray_task import Order, Reply, carry_out
+from gridreg.ablation.records import Study
+from gridreg.ablation.runners import Event, Report, finish_or_fail
+from gridreg.ablation.store import Store
+from gridreg.ablation.workers import Worker
+from gridreg.errors import InputError
+from gridreg.training.progress import Interruption, interruptible
+
+__all__ = ["RayRunner"]
+
+_POLL = 0.5
+_SAVING_SECONDS = 60.0
+
+
+@dataclass(frozen=True)
+class RayRunner:
+    """Runs as Ray tasks, each of which declares ``threads`` processors.
+
+    A run whose worker or node is lost goes to another one. What a worker computes comes back through this process, so
+    nothing but Ray connects the machines; gridreg must be installed on all of them in the same version.
+
+    Args:
+        address: ``auto``, ``HOST:PORT`` or ``ray://HOST:PORT``; None: Ray is started on this machine, and ends with the
+            study.
+        workers: runs at a time; default: as many as the cluster has processors for.
+        threads: of each run.
+        ship_scenes: send views through Ray; otherwise a scene is found at its path, or by its name below the
+            folder that GRIDREG_DATA names on that machine.
+        keep_checkpoints: leave those of finished runs in their folders.
+
+    Raises:
+        InputError: if Ray is not installed.
+    """
+
+    address: str | None = None
+    workers: int | None = None
+    threads: int = 1
+    ship_scenes: bool = False
+    keep_checkpoints: bool = True
+
+    def __post_init__(self) -> None:
+        import_ray(self.address)
+
+    def run(self, store: Store, study: Study, report: Report) -> None:
+        """See `gridreg.ablation.runners.Runner.run`."""
+        count = self.workers or max(1, usable_cores() // self.threads)
+        with connected(self.address, cpus=count * self.threads) as ray, Heartbeat(store.beat) as heartbeat:
+            desk = _Desk(self, ray, store, study, report, heartbeat)
+            # Inside the connection, because connecting installs handlers of Ray's.
+            with interruptible() as interruption:
+                desk.work(interruption)
+        if interruption.requested:
+            raise KeyboardInterrupt
+
+
+class _Desk:
+    """Hands out runs and takes results in."""
+
+    def __init__(
+        self, runner: RayRunner, ray: Any, store: Store, study: Study, report: Report, heartbeat: Heartbeat
+    ) -> None:
+        self.runner, self.ray, self.store, self.study = runner, ray, store, study
+        self.report, self.heartbeat = report, heartbeat
+        self.worker = Worker.current()
+        self.pending: dict[Any, Claim] = {}
+        self.scenes = Scenes(store.folder / "scenes")
+        self.shipped: dict[tuple[Any, ...], Any] = {}
+        # Retries are the store's business: it knows what is finished, and keeps the checkpoint.
+        self.task = ray.remote(num_cpus=runner.threads, max_retries=0)(_remote)
+
+    def work(self, interruption: Interruption) -> None:
+        """Until nothing is left, or somebody asks to stop."""
+        try:
+            while not interruption.requested:
+                self._hand_out()
+                if self.pending:
+                    self._take_in(_POLL)
+                elif self.store.counts(self.study)["running"] == 0:
+                    return
+                else:
+                    time.sleep(_POLL)
+        finally:
+            self._stop()
+
+    def _hand_out(self) -> None:
+        while len(self.pending) < self._room():
+            claim = self.store.claim(self.worker, self.study)
+            if claim is None:
+                return
+            self.heartbeat.add(claim)
+            self.report(Event("started", claim.spec))
+            try:
+                order = Order(
+                    claim.spec.to_json(),
+                    pack_folder(claim.folder),
+                    self.runner.threads,
+                    self.runner.keep_checkpoints,
+                    self.study.modules,
+                )
+                scene = self._ship(claim) if self.runner.ship_scenes else []
+            except InputError as error:
+                self.heartbeat.drop(claim)
+                finish_or_fail(self.store, claim, self.report, reason=str(error))
+                continue
+            self.pending[self.task.remote(order, scene)] = claim
+
+    def _room(self) -> int:
+        """Runs that fit into the cluster as it is now."""
+        if self.runner.workers is not None:
+            return self.runner.workers
+        return max(1, int(self.ray.cluster_resources().get("CPU", 0) // self.runner.threads))
+
+    def _ship(self, claim: Claim) -> list[Any]:
+        # In a list, because Ray would fetch a bare reference for the task, even where the scene is known already.
+        key = scene_key(claim.spec)
+        if key not in self.shipped:
+            self.shipped[key] = self.ray.put(self.scenes.get(claim.spec))
+        return [self.shipped[key]]
+
+    def _take_in(self, seconds: float) -> None:
+        ready, _ = self.ray.wait(list(self.pending), num_returns=1, timeout=seconds)
+        for reference in ready:
+            claim = self.pending.pop(reference)
+            self.heartbeat.drop(claim)
+            try:
+                self._settle(claim, reference)
+            except ClaimLostError:
+                self.report(Event("lost", claim.spec))
+
+    def _settle(self, claim: Claim, reference: Any) -> None:
+        errors = self.ray.exceptions
+        try:
+            reply: Reply = self.ray.get(reference)
+        except errors.TaskCancelledError:
+            self._give_back(claim, "interrupted")
+        except errors.RayTaskError as error:
+            # The task itself catches what a run can raise; this is a worker that cannot even begin.
+            finish_or_fail(self.store, claim, self.report, reason=_line(error))
+        except (errors.WorkerCrashedError, errors.OutOfMemoryError) as error:
+            self.store.lose_claim(claim, _line(error))
+            self.report(Event("lost", claim.spec))
+        except errors.RayError as error:
+            # A node that went away is no fault of the run's.
+            print(f"{claim.spec.describe()}: {_line(error)}", file=sys.stderr)
+            self._give_back(claim, "lost")
+        else:
+            self._keep(claim, reply)
+
+    def _keep(self, claim: Claim, reply: Reply) -> None:
+        if not self.store.beat(claim):
+            self.report(Event("lost", claim.spec))
+            return
+        try:
+            unpack_folder(reply.files, claim.folder)
+        except InputError as error:
+            finish_or_fail(self.store, claim, self.report, reason=str(error))
+            return
+        if reply.metrics is None and not reply.reason:
+            self._give_back(claim, "interrupted")
+            return
+        finish_or_fail(
+            self.store,
+            claim,
+            self.report,
+            reason=reply.reason,
+            metrics=reply.metrics,
+            machine=reply.machine,
+            fingerprint=reply.fingerprint,
+        )
+
+    def _give_back(self, claim: Claim, outcome: Any) -> None:
+        self.store.release(claim, outcome)
+        self.report(Event(outcome, claim.spec))
+
+    def _stop(self) -> None:
+        """Ask the workers to save, and take in what they send; the rest waits in the store."""
+        for reference in self.pending:
+            self.ray.cancel(reference, force=False)
+        end = time.monotonic() + _SAVING_SECONDS
+        try:
+            while self.pending and time.monotonic() < end:
+                self._take_in(_POLL)
+        finally:
+            for claim in self.pending.values():
+                self.heartbeat.drop(claim)
+                self._give_back(claim, "interrupted")
+            self.pending.clear()
+
+
+def _remote(order: Order, scene: list[Any]) -> Reply:
+    import ray
+
+    return carry_out(order, [lambda: ray.get(scene[0])] if scene else [])
+
+
+def _line(error: BaseException) -> str:
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return f"{type(error).__name__}: {lines[0] if lines else 'no reason given'}"
