@@ -119,6 +119,13 @@ class Section:
     rows: tuple[Row, ...]
     results: Mapping[str, tuple[RunResult, ...]]
 
+    @property
+    def extent(self) -> str:
+        """Scenes and seeds in a line, such as ``lego, chair; seeds 0, 1, 2``."""
+        seeds = sorted({result.spec.seed for own in self.results.values() for result in own})
+        text = ", ".join(self.scenes)
+        return f"{text}; seed{'s' * (len(seeds) > 1)} {', '.join(map(str, seeds))}" if seeds else text
+
 
 def figure_of(result: RunResult, metric: str) -> float | None:
     """A figure of a finished run: a mean over test views, or ``seconds`` of training; None if it has no finite one."""

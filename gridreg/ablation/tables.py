@@ -131,7 +131,7 @@ def markdown(title: str, sections: Sequence[Section]) -> str:
     """
     parts = [f"# {_markdown(title)}"]
     for section in sections:
-        parts.append(f"## {_markdown(section.setting.title)}")
+        parts += [f"## {_markdown(section.setting.title)}", f"Scenes: {_markdown(section.extent)}"]
         parts.append(_markdown_table(_COLUMNS, [_cells(row) for row in section.rows]))
         if len(section.scenes) > 1:
             head = ("PSNR (dB)", *section.scenes)
@@ -149,7 +149,7 @@ def latex(title: str, sections: Sequence[Section]) -> str:
     """
     parts = [r"% \usepackage{booktabs,amssymb}"]
     for section in sections:
-        caption = f"{title}: {section.setting.title}. {LEGEND}"
+        caption = f"{title}: {section.setting.title}. Scenes: {section.extent}. {LEGEND}"
         parts.append(_latex_table(_COLUMNS, [_cells(row) for row in section.rows], caption))
         if len(section.scenes) > 1:
             head = ("PSNR (dB)", *section.scenes)
