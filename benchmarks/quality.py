@@ -24,9 +24,12 @@ from gridreg.training.options import TrainOptions
 RESULTS = Path(__file__).parent / "results" / "quality"
 
 
-def result_path(scene: str, run: str, seed: int, steps: int | None, protocol: str) -> Path:
+def result_path(
+    scene: str, run: str, seed: int, steps: int | None, protocol: str, changes: tuple[str, ...]
+) -> Path:
     length = "" if steps is None else f"-{steps}steps"
-    return RESULTS / f"{scene}-{protocol}-{run.replace(':', '+')}{length}-seed{seed}.json"
+    other = "".join(f"-{change}" for change in sorted(changes)).replace("/", "_")
+    return RESULTS / f"{scene}-{protocol}-{run.replace(':', '+')}{other}{length}-seed{seed}.json"
 
 
 def score(
@@ -38,7 +41,8 @@ def score(
     backend: str,
     changes: tuple[str, ...],
 ) -> None:
-    target = result_path(folder.name, run if backend == "auto" else f"{run}-{backend}", seed, steps, protocol)
+    name = run if backend == "auto" else f"{run}-{backend}"
+    target = result_path(folder.name, name, seed, steps, protocol, changes)
     if target.exists():
         return
     preset, _, composition = run.partition(":")
@@ -68,8 +72,11 @@ def score(
         run,
         "--seeds",
         str(seed),
+        *([] if steps is None else ["--steps", str(steps)]),
+        *([] if backend == "auto" else ["--backend", backend]),
         *(["--set", *changes] if changes else []),
     ]
+    metrics["changes"] = list(changes)
     write_json(target, metrics)
     print(row(metrics), flush=True)
 
@@ -77,7 +84,8 @@ def score(
 def row(metrics: dict) -> str:
     mean, seconds = metrics["mean"], metrics["seconds"]
     return (
-        f"| {metrics['scene']} | {metrics['protocol']} | {metrics['run']} | {metrics['seed']} | {metrics['steps']} "
+        f"| {metrics['scene']} | {metrics['protocol']} | {' '.join([metrics['run'], *metrics.get('changes', [])])} "
+        f"| {metrics['seed']} | {metrics['steps']} "
         f"| {mean['psnr']:.2f} | {mean['ssim_gaussian']:.4f} | {mean['ssim_uniform']:.4f} | {seconds['train']:.0f} "
         f"| {metrics['versions']['threads']} |"
     )
