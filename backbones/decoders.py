@@ -15,7 +15,30 @@ from backbones.kernels.linear import Precision
 from gridreg.encodings import octaves_of_channels
 from gridreg.sites import Site, inputs, parameters
 
-__all__ = ["DECODERS", "MLPDecoder", "RGBDecoder", "SHDecoder", "make_decoder"]
+__all__ = ["DECODERS", "Basis", "MLPDecoder", "RGBDecoder", "SHDecoder", "make_decoder"]
+
+
+class Basis(nn.Linear):
+    """The linear map from components to features (TensoRF's matrix ``B``), without bias.
+
+    Args:
+        components: that it reads.
+        features: that it gives.
+        precision: of the product on the CPU, see `backbones.kernels.mlp`.
+    """
+
+    def __init__(self, components: int, features: int, precision: Precision = "auto") -> None:
+        super().__init__(components, features, bias=False)
+        self.precision = precision
+
+    @property
+    def input_dtype(self) -> torch.dtype:
+        """What it rounds its input to."""
+        return kernels.product_dtype(self.precision)
+
+    def forward(self, components: Tensor) -> Tensor:
+        """Components ``(N, C)``, float32 or `input_dtype`, to features ``(N, F)``, float32."""
+        return kernels.mlp(components, [(self.weight, None)], precision=self.precision)
 
 
 class MLPDecoder(nn.Module):

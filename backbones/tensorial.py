@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from backbones import kernels
-from backbones.decoders import make_decoder
+from backbones.decoders import Basis, make_decoder
 from backbones.kernels.adam import FusedAdam
 from gridreg.rendering import Marched, OccupancyGrid, Rays
 from gridreg.sites import Site
@@ -103,7 +103,8 @@ class TensorialField(nn.Module):
         self.register_buffer("bounds", bounds.clone().float())
         self.resolution = resolution
         count, self.decoder = make_decoder(decoder, features, **decoder_options)
-        self.basis = nn.Linear(appearance_channels, count, bias=False)
+        # What has no network of bfloat16 behind it keeps its features whole.
+        self.basis = Basis(appearance_channels, count, getattr(self.decoder, "precision", "float32"))
         _initialise([self.basis, *self.decoder.modules()], generator)
         self.distance_scale = distance_scale
         if density_shift is None:
@@ -122,6 +123,10 @@ class TensorialField(nn.Module):
     def appearance_features(self, u: Tensor) -> Tensor:
         """Normalised positions ``(N, 3)`` to components ``(N, C)``."""
         raise TypeError(f"{type(self).__name__} must define appearance_features")
+
+    def _components(self, u: Tensor) -> Tensor:
+        """`appearance_features` in the precision that the basis reads."""
+        return self.appearance_features(u)
 
     def activate(self, features: Tensor) -> Tensor:
         """Density per world unit from density features."""
@@ -175,7 +180,7 @@ class TensorialField(nn.Module):
 
     def _colour(self, x: Tensor, directions: Tensor, ray_indices: Tensor | None) -> Tensor:
         u = self.normalise(x)
-        features = self.basis(self.appearance_features(u))
+        features = self.basis(self._components(u))
         return self.decoder(features, directions, 2 * u - 1, ray_indices)  # type: ignore[no-any-return]
 
     def voxel_size(self) -> float:

@@ -62,12 +62,15 @@ class VMField(TensorialField):
 
     def appearance_features(self, u: Tensor) -> Tensor:
         """Normalised positions ``(N, 3)`` to the concatenated products ``(N, 3 C)``."""
-        return kernels.vm_features(
-            u,
-            list(self.appearance_planes),
-            list(self.appearance_lines),
-            _open_components(self.appearance_planes, self.appearance_lines),
-        )
+        return self._products(u, torch.float32)
+
+    def _components(self, u: Tensor) -> Tensor:
+        return self._products(u, self.basis.input_dtype)
+
+    def _products(self, u: Tensor, dtype: torch.dtype) -> Tensor:
+        opened = _open_components(self.appearance_planes, self.appearance_lines)
+        planes, lines = list(self.appearance_planes), list(self.appearance_lines)
+        return kernels.vm_features(u, planes, lines, opened, dtype)
 
     def _marched(
         self, march: kernels.March, activation: kernels.Activation, transmittance_bound: float

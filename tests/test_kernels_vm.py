@@ -263,3 +263,21 @@ def test_bad_input(change, message):
     for function in FUNCTIONS:
         with pytest.raises(InputError, match=message):
             function(**{**arguments, **change})
+
+
+@given(seeds, edges, channels)
+def test_features_in_bfloat16_are_features_rounded(seed, shape, count):
+    planes, lines = make_grids(seed, shape, count)
+    u = make_positions(seed, 40)
+    slope = torch.randn(40, 3 * count, generator=torch.Generator().manual_seed(seed)).bfloat16()
+    results = []
+    for dtype in (torch.float32, torch.bfloat16):
+        grids = [x.clone().requires_grad_() for x in (*planes, *lines)]
+        found = kernels.vm_features(u, grids[:3], grids[3:], None, dtype)
+        assert found.dtype == dtype
+        results.append([found.detach().float(), *torch.autograd.grad(found, grids, slope.to(dtype))])
+    (whole, *gradients), (low, *low_gradients) = results
+    assert torch.equal(low, whole.bfloat16().float())
+    # Gradients come in as bfloat16 and are summed in float32 as always.
+    for a, b in zip(low_gradients, gradients, strict=True):
+        torch.testing.assert_close(a, b, atol=1e-6, rtol=1e-5)

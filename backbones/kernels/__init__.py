@@ -16,11 +16,12 @@ from backbones.kernels.dispatch import (
 )
 from backbones.kernels.encode import encode, encode_together
 from backbones.kernels.encoded import Block, encoded_mlp
-from backbones.kernels.linear import mlp
+from backbones.kernels.linear import Layer, mlp, product_dtype
 
 __all__ = [
     "Activation",
     "Block",
+    "Layer",
     "March",
     "accumulate_into_grad",
     "cp_density",
@@ -30,6 +31,7 @@ __all__ = [
     "encode_together",
     "encoded_mlp",
     "mlp",
+    "product_dtype",
     "vm_density",
     "vm_features",
     "vm_march_density",

@@ -178,9 +178,12 @@ def vm_density(u: Tensor, planes: Sequence[Tensor], lines: Sequence[Tensor], ope
     return _lookup(vm.density, vm_gradient.density_backward, u, planes, lines, open_channels)
 
 
-def vm_features(u: Tensor, planes: Sequence[Tensor], lines: Sequence[Tensor], open_channels: int) -> Tensor:
+def vm_features(
+    u: Tensor, planes: Sequence[Tensor], lines: Sequence[Tensor], open_channels: int, dtype: torch.dtype
+) -> Tensor:
     """See `backbones.kernels.vm_features`."""
-    return _lookup(vm.features, vm_gradient.features_backward, u, planes, lines, open_channels)
+    forward = vm.low_features if dtype == torch.bfloat16 else vm.features
+    return _lookup(forward, vm_gradient.features_backward, u, planes, lines, open_channels)
 
 
 def cp_density(u: Tensor, lines: Sequence[Tensor], open_channels: int) -> Tensor:

@@ -35,9 +35,15 @@ def padded_rows(count: int) -> int:
 
 
 def chunks(rows: int) -> Iterator[slice]:
-    """Parts of padded rows."""
+    """Parts of at most `CHUNK` rows."""
     for start in range(0, rows, CHUNK):
         yield slice(start, min(start + CHUNK, rows))
+
+
+def _part(x: Tensor, part: slice) -> Tensor:
+    """Some rows, with zeros behind them up to a size that is multiplied."""
+    missing = padded_rows(part.stop - part.start) - (part.stop - part.start)
+    return F.pad(x[part], (0, 0, 0, missing)) if missing else x[part]
 
 
 def product(x: Tensor, weight: Tensor, bias: Tensor | None, relu: bool) -> Tensor:
@@ -86,9 +92,9 @@ class Chain:
     """What a backward pass needs.
 
     Args:
-        x: ``(M, in)`` input.
+        x: ``(N, in)`` input.
         weights: of each layer, in the input's precision.
-        hidden: of each layer but the last, its output by chunk.
+        hidden: of each layer but the last, its output by chunk, padded.
     """
 
     x: Tensor
@@ -97,7 +103,7 @@ class Chain:
 
     @property
     def rows(self) -> int:
-        """M."""
+        """N."""
         return int(self.x.shape[0])
 
 
@@ -123,30 +129,31 @@ def chain_forward(
     """Linear layers with ReLU between them.
 
     Args:
-        x: ``(M, in)``, M padded (`padded_rows`); its precision is that of the products.
+        x: ``(N, in)``; its precision is that of the products.
         layers: float32 weights ``(out, in)`` and biases.
-        offset: added to the first layer's output: ``(M, out)``, or ``(R, out)`` with ``rows (M,)``.
+        offset: added to the first layer's output: ``(N, out)``, or ``(R, out)`` with ``rows (N,)``.
 
     Returns:
-        ``(M, out)`` float32 and what the backward pass needs.
+        ``(N, out)`` float32 and what the backward pass needs.
     """
     weights = [weight.to(x.dtype).contiguous() for weight, _ in layers]
     biases = [None if bias is None else bias.to(x.dtype) for _, bias in layers]
     hidden: list[list[Tensor]] = [[] for _ in layers[1:]]
     out = torch.empty(x.shape[0], weights[-1].shape[0])
     for part in chunks(x.shape[0]):
-        value = x[part]
+        count = part.stop - part.start
+        value = _part(x, part)
         for place, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
             relu = place + 1 < len(weights)
             if place == 0 and offset is not None:
                 value = product(value, weight, bias, False)
-                value += offset[part] if rows is None else offset.index_select(0, rows[part])
+                value[:count] += offset[part] if rows is None else offset.index_select(0, rows[part])
                 value = value.relu_() if relu else value
             else:
                 value = product(value, weight, bias, relu)
             if relu:
                 hidden[place].append(value)
-        out[part] = value
+        out[part] = value[:count]
     return out, Chain(x, weights, hidden)
 
 
@@ -157,12 +164,12 @@ def chain_backward(
 
     Args:
         saved: what it returned.
-        gradient: ``(M, out)`` float32, 0 in the padding.
+        gradient: ``(N, out)`` float32.
         columns: how many columns of the input's gradient are wanted, from the first on.
         of_first: if given, the gradient of the first layer's output is appended, by chunk.
 
     Returns:
-        Gradients of the input, ``(M, columns)`` in its precision, and of each layer's weight and bias, float32.
+        Gradients of the input, ``(N, columns)`` in its precision, and of each layer's weight and bias, float32.
     """
     depth, dtype = len(saved.weights), saved.x.dtype
     of_weights = [torch.zeros(weight.shape) for weight in saved.weights]
@@ -172,16 +179,17 @@ def chain_backward(
     back = [weight.t().contiguous() for weight in saved.weights]
     back[0] = back[0][:columns]
     for number, part in enumerate(chunks(saved.rows)):
-        slope = gradient[part].to(dtype)
+        count = part.stop - part.start
+        slope = _part(gradient, part).to(dtype)
         of_biases[-1] += gradient[part].sum(0)
         for place in reversed(range(depth)):
-            read = saved.x[part] if place == 0 else saved.hidden[place - 1][number]
+            read = _part(saved.x, part) if place == 0 else saved.hidden[place - 1][number]
             of_weights[place] += slope.t() @ read
             if place > 0:
                 slope, total = _gated(product(slope, back[place], None, False), read)
                 of_biases[place - 1] += total
         if of_first is not None:
-            of_first.append(slope)
+            of_first.append(slope[:count])
         if columns:
-            of_x[part] = product(slope, back[0], None, False)
+            of_x[part] = product(slope, back[0], None, False)[:count]
     return of_x, list(zip(of_weights, of_biases, strict=True))

@@ -87,13 +87,22 @@ def vm_density(
 
 
 def vm_features(
-    u: Tensor, planes: Sequence[Tensor], lines: Sequence[Tensor], open_channels: int | None = None
+    u: Tensor,
+    planes: Sequence[Tensor],
+    lines: Sequence[Tensor],
+    open_channels: int | None = None,
+    dtype: torch.dtype = torch.float32,
 ) -> Tensor:
-    """Products of planes and lines, concatenated: ``(N, 3 C)``. Arguments as for `vm_density`."""
+    """Products of planes and lines, concatenated: ``(N, 3 C)``. Arguments as for `vm_density`.
+
+    Args:
+        dtype: of the result: float32, or bfloat16 for products that round it so in any case. Sums are float32.
+    """
     _check(u, planes, lines, open_channels)
     if _takes_compiled(u, *planes, *lines):
-        return autograd.vm_features(u, planes, lines, _count(lines, open_channels))
-    return reference.vm_features(u, planes, lines, open_channels)
+        return autograd.vm_features(u, planes, lines, _count(lines, open_channels), dtype)
+    found = reference.vm_features(u, planes, lines, open_channels)
+    return found if dtype == torch.float32 else found.to(dtype)
 
 
 def cp_density(u: Tensor, lines: Sequence[Tensor], open_channels: int | None = None) -> Tensor:

@@ -16,7 +16,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from backbones.kernels.bfloat16 import load_low, store_low
-from backbones.kernels.chain import chain_backward, chain_forward, padded_rows
+from backbones.kernels.chain import chain_backward, chain_forward
 from backbones.kernels.compiler import (
     float32,
     inline,
@@ -149,12 +149,11 @@ def _encode_into(out: Tensor, at: int, x: Tensor, octaves: int) -> None:
 
 
 def _encoded(blocks: Sequence[Block], count: int) -> Tensor:
-    """``(M, W)`` in bfloat16: the encodings, a column of ones, and zeros; M and W rounded up."""
+    """``(N, W)`` in bfloat16: the encodings, a column of ones, and zeros; W rounded up."""
     width = sum(block.width for block in blocks)
-    out = torch.empty(padded_rows(count), -(-(width + 1) // LANES) * LANES, dtype=torch.bfloat16)
+    out = torch.empty(count, -(-(width + 1) // LANES) * LANES, dtype=torch.bfloat16)
     out[:, width:] = 0
     out[:, width] = 1
-    out[count:, :width] = 0
     at = 0
     for block in blocks:
         if block.rows is None:
@@ -185,7 +184,7 @@ class _EncodedMLP(Function):
         layers += [(flat[i], flat[i + 1]) for i in range(2, len(flat), 2)]
         out, saved = chain_forward(encoded, layers)
         ctx.saved, ctx.blocks, ctx.count = saved, [(b.x.shape[1], b.octaves, b.width) for b in blocks], count
-        return out[:count]
+        return out
 
     @staticmethod
     @once_differentiable
@@ -196,8 +195,7 @@ class _EncodedMLP(Function):
             end += width
             ends.append(end)
         columns = max((e for e, need in zip(ends, wanted, strict=True) if need), default=0)
-        padded = F.pad(gradient, (0, 0, 0, ctx.saved.rows - ctx.count))
-        of_x, of_layers = chain_backward(ctx.saved, padded, columns)
+        of_x, of_layers = chain_backward(ctx.saved, gradient, columns)
         of_first, width = of_layers[0][0], ends[-1]
         results: list[Tensor | None] = []
         for (dims, octaves, size), end, need in zip(ctx.blocks, ends, wanted, strict=True):

@@ -18,7 +18,7 @@ from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
-from backbones.kernels.chain import chain_backward, chain_forward, padded_rows
+from backbones.kernels.chain import chain_backward, chain_forward
 from gridreg.errors import InputError
 from gridreg.rendering.backends import takes_compiled
 
@@ -84,37 +84,30 @@ class _MLP(Function):
         x: Tensor,
         *flat: Tensor | None,
     ) -> Tensor:
-        count = x.shape[0]
-        padded = torch.zeros(padded_rows(count), x.shape[1], dtype=dtype)
-        padded[:count] = x
         share = None if offset is None else offset.to(dtype)
-        missing = padded.shape[0] - count
-        if rows is not None:
-            rows = F.pad(rows, (0, missing))
-        elif share is not None:
-            share = F.pad(share, (0, 0, 0, missing))
         layers = [(cast(Tensor, flat[i]), flat[i + 1]) for i in range(0, len(flat), 2)]
-        out, ctx.saved = chain_forward(padded, layers, share, rows)
-        ctx.rows, ctx.count, ctx.width = rows, count, x.shape[1]
+        out, ctx.saved = chain_forward(x.to(dtype).contiguous(), layers, share, rows)
+        ctx.rows, ctx.dtype = rows, x.dtype
         ctx.offsets = 0 if offset is None else offset.shape[0]
-        return out[:count]
+        return out
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        wanted, count = ctx.needs_input_grad, ctx.count
-        gradient = F.pad(gradient, (0, 0, 0, ctx.saved.rows - count))
+        wanted = ctx.needs_input_grad
         slopes: list[Tensor] | None = [] if wanted[2] else None
-        of_x, of_layers = chain_backward(ctx.saved, gradient, ctx.width if wanted[3] else 0, slopes)
+        of_x, of_layers = chain_backward(
+            ctx.saved, gradient, ctx.saved.x.shape[1] if wanted[3] else 0, slopes
+        )
         of_offset: Tensor | None = None
         if slopes is not None:
-            of_offset = torch.cat(slopes)[:count].float()
+            of_offset = torch.cat(slopes).float()
             if ctx.rows is not None:
                 into = torch.zeros(ctx.offsets, of_offset.shape[1])
-                of_offset = into.index_add_(0, ctx.rows[:count], of_offset)
+                of_offset = into.index_add_(0, ctx.rows, of_offset)
         flat = [tensor for pair in of_layers for tensor in pair]
         kept = (g if need else None for g, need in zip(flat, wanted[4:], strict=True))
-        return (None, None, of_offset, of_x[:count].float() if wanted[3] else None, *kept)
+        return (None, None, of_offset, of_x.to(ctx.dtype) if wanted[3] else None, *kept)
 
 
 def check_layers(layers: Sequence[Layer | tuple[Tensor, Tensor | None]], width: int) -> int:
@@ -147,7 +140,7 @@ def mlp(
     """Linear layers with ReLU between them.
 
     Args:
-        x: ``(N, in)``.
+        x: ``(N, in)``; may be bfloat16 where products are, and then its gradient is.
         layers: pairs of weight ``(out, in)`` and bias ``(out,)`` or None.
         offset: ``(N, out)`` of the first layer, added to it before its ReLU; or ``(R, out)`` with ``rows``:
             what depends on the ray alone, such as its direction, is computed once per ray.
@@ -181,10 +174,11 @@ def mlp(
         raise InputError(f"rows: found {tuple(rows.shape)}, expected ({x.shape[0]},) beside an offset")
     flat = [tensor for layer in layers for tensor in layer]
     given = [tensor for tensor in (x, offset, *flat) if tensor is not None]
-    if takes_compiled(*given):
+    low = x.dtype == torch.bfloat16 and product_dtype(precision) == torch.bfloat16
+    if takes_compiled(*given[low:]):
         result: Tensor = _MLP.apply(product_dtype(precision), rows, offset, x, *flat)  # type: ignore[no-untyped-call]
         return result
-    hidden = x
+    hidden = x.to(layers[0][0].dtype)
     for place, (weight, bias) in enumerate(layers):
         hidden = F.linear(hidden, weight, bias)
         if place == 0 and offset is not None:

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from backbones.kernels.bfloat16 import put
 from backbones.kernels.compiler import (
     float32,
     inline,
@@ -18,14 +19,15 @@ from backbones.kernels.compiler import (
     next_task,
     scratch,
     size,
+    uint16,
     vector,
 )
 from backbones.kernels.lookup import ahead, bilinear, corners, linear, prefetch_cell
 from backbones.kernels.places import BATCH, PLACES, axes, batch, find
-from backbones.kernels.simd import LANES, one, store, total, wide
+from backbones.kernels.simd import LANES, one, total, wide
 from backbones.kernels.threading import launch
 
-__all__ = ["density", "features", "find_cells", "look_up"]
+__all__ = ["density", "features", "find_cells", "look_up", "low_features"]
 
 
 @inline
@@ -63,11 +65,11 @@ def _write(
     """Plane times line to ``out`` from element ``to`` on; 0 for channels that are not read."""
     blocks = read - read % LANES
     for c in range(0, blocks, LANES):
-        store(out, to + c, _product(grids, at + c, below + c, channels, down, w, share, wide()))
+        put(out, to + c, _product(grids, at + c, below + c, channels, down, w, share, wide()))
     for c in range(blocks, read):
-        store(out, to + c, _product(grids, at + c, below + c, channels, down, w, share, one()))
+        put(out, to + c, _product(grids, at + c, below + c, channels, down, w, share, one()))
     for c in range(read, channels):
-        out[to + c] = float32(0)
+        put(out, to + c, one())
 
 
 @inline
@@ -108,8 +110,8 @@ def look_up(
 
 
 @inline
-def _forward(table: Any, summed: Any) -> Any:
-    u, read, out = vector(table, 0, float32), integer(table, 7), vector(table, 8, float32)
+def _forward(table: Any, out: Any, summed: Any) -> Any:
+    u, read = vector(table, 0, float32), integer(table, 7)
     samples, channels = size(table, 0, 0), size(table, 4, 1)
     shape = size(table, 6, 0), size(table, 5, 0), size(table, 4, 0)
     places = scratch(PLACES, int32), scratch(PLACES, float32)
@@ -130,13 +132,19 @@ def _forward(table: Any, summed: Any) -> Any:
 @kernel
 def _density(table: Any) -> None:
     """u, three planes, three lines, channels to read, out."""
-    _forward(table, True)
+    _forward(table, vector(table, 8, float32), True)
 
 
 @kernel
 def _features(table: Any) -> None:
     """u, three planes, three lines, channels to read, out."""
-    _forward(table, False)
+    _forward(table, vector(table, 8, float32), False)
+
+
+@kernel
+def _low_features(table: Any) -> None:
+    """Arguments as of `_features`; out is bfloat16."""
+    _forward(table, vector(table, 8, uint16), False)
 
 
 def density(u: Tensor, planes: Sequence[Tensor], lines: Sequence[Tensor], read: int) -> Tensor:
@@ -146,8 +154,20 @@ def density(u: Tensor, planes: Sequence[Tensor], lines: Sequence[Tensor], read: 
     return out
 
 
-def features(u: Tensor, planes: Sequence[Tensor], lines: Sequence[Tensor], read: int) -> Tensor:
-    """``(N, 3 C)``; arguments as for `density`."""
-    out = torch.empty(u.shape[0], 3 * lines[0].shape[1])
-    launch(_features, -(-u.shape[0] // BATCH), u, *planes, *lines, read, out)
+def features(
+    u: Tensor,
+    planes: Sequence[Tensor],
+    lines: Sequence[Tensor],
+    read: int,
+    dtype: torch.dtype = torch.float32,
+) -> Tensor:
+    """``(N, 3 C)`` of ``dtype``, float32 or bfloat16; arguments as for `density`."""
+    out = torch.empty(u.shape[0], 3 * lines[0].shape[1], dtype=dtype)
+    compiled = _low_features if dtype == torch.bfloat16 else _features
+    launch(compiled, -(-u.shape[0] // BATCH), u, *planes, *lines, read, out)
     return out
+
+
+def low_features(u: Tensor, planes: Sequence[Tensor], lines: Sequence[Tensor], read: int) -> Tensor:
+    """`features` in bfloat16."""
+    return features(u, planes, lines, read, torch.bfloat16)

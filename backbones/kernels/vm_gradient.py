@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from backbones.kernels.bfloat16 import get
 from backbones.kernels.compiler import (
     Kernel,
     float32,
@@ -18,6 +19,7 @@ from backbones.kernels.compiler import (
     kernel,
     next_task,
     size,
+    uint16,
     vector,
 )
 from backbones.kernels.lookup import ahead, bilinear, corners, linear, prefetch_cell, prefetch_row
@@ -85,10 +87,10 @@ def _serve(
         g = shares[e + 3]
         n = (3 * int64(nodes[e + 3]) + k) * channels
         for c in range(0, blocks, LANES):
-            gc = wide() + g if summed else load(upstream, n + c, wide())
+            gc = wide() + g if summed else get(upstream, n + c, wide())
             _add(grids, at + c, below + c, down, w, share, gc, to, i + c, j + c, m + c, channels, wide())
         for c in range(blocks, read):
-            gc = g if summed else load(upstream, n + c, one())
+            gc = g if summed else get(upstream, n + c, one())
             _add(grids, at + c, below + c, down, w, share, gc, to, i + c, j + c, m + c, channels, one())
 
 
@@ -107,8 +109,8 @@ def _clear_line(table: Any, k: Any, part: Any, channels: Any) -> Any:
 
 
 @inline
-def _backward(table: Any, summed: Any) -> Any:
-    read, upstream, copies = integer(table, 7), vector(table, 8, float32), vector(table, 12, float32)
+def _backward(table: Any, upstream: Any, summed: Any) -> Any:
+    read, copies = integer(table, 7), vector(table, 12, float32)
     starts, nodes, shares = vector(table, 13, int64), vector(table, 14, int32), vector(table, 15, float32)
     waste = vector(table, 16, float32)
     channels, samples, stride = size(table, 4, 1), size(table, 0, 0), size(table, 13, 1)
@@ -139,13 +141,19 @@ def _backward(table: Any, summed: Any) -> Any:
 @kernel
 def _density_backward(table: Any) -> None:
     """u, planes, lines, channels to read, upstream, plane gradients, line copies, listing, waste."""
-    _backward(table, True)
+    _backward(table, vector(table, 8, float32), True)
 
 
 @kernel
 def _features_backward(table: Any) -> None:
     """Arguments as of `_density_backward`."""
-    _backward(table, False)
+    _backward(table, vector(table, 8, float32), False)
+
+
+@kernel
+def _low_features_backward(table: Any) -> None:
+    """Arguments as of `_density_backward`; upstream is bfloat16."""
+    _backward(table, vector(table, 8, uint16), False)
 
 
 def _run(
@@ -199,4 +207,13 @@ def features_backward(
     plane_gradients: Sequence[Tensor],
 ) -> list[Tensor]:
     """Adds to ``plane_gradients`` in place and returns the gradients of the lines; upstream ``(N, 3 C)``."""
-    return _run(_features_backward, u, planes, lines, read, upstream, plane_gradients)
+    low = upstream.dtype == torch.bfloat16
+    return _run(
+        _low_features_backward if low else _features_backward,
+        u,
+        planes,
+        lines,
+        read,
+        upstream,
+        plane_gradients,
+    )
