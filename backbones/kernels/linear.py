@@ -101,7 +101,7 @@ class _MLP(Function):
         )
         of_offset: Tensor | None = None
         if slopes is not None:
-            of_offset = torch.cat(slopes).float()
+            of_offset = torch.cat([torch.empty(0, ctx.saved.weights[0].shape[0]), *slopes]).float()
             if ctx.rows is not None:
                 into = torch.zeros(ctx.offsets, of_offset.shape[1])
                 of_offset = into.index_add_(0, ctx.rows, of_offset)
