@@ -1,0 +1,233 @@
+"""The studies that are shipped: each loads, its rows are what they say, and their regularizers find their places."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+import gridreg
+from gridreg.ablation.records import RunSpec, Study
+from gridreg.ablation.study import load_study
+from gridreg.fields import make_field
+
+STUDIES = Path(__file__).parent.parent / "examples" / "studies"
+PATHS = sorted(STUDIES.glob("*.yaml"))
+SCENES = ("lego", "chair", "drums", "ficus", "mic", "ship", "materials", "hotdog")
+
+ROWS = {
+    "table1": [
+        "tensorf", "none", "few_tensorf", "few_tensorf_printed", "few_tensorf_authors", "freenerf on VM", "fourierf",
+        "sanerf", "few_tensorf_finetuned", "freenerf",
+    ],
+    "table2": ["tensorf", "few_tensorf", "few_tensorf_finetuned", "freenerf, 15k", "freenerf, 50k"],
+    "table3": ["tensorf", "few_tensorf", "fixed ratio 0.8"],
+    "figure3": ["tensorf", "few_tensorf"],
+    "masks_by_site": ["no masks", "density", "appearance", "encodings", "all"],
+    "end_of_schedule": ["no masks", *(f"masks, until={u}" for u in (0.1, 0.2, 0.5, 0.7, 0.9, 1.0))],
+    "block_size": ["no masks", *(f"masks, block={b}" for b in (1, 3, 5, 8, 16))],
+    "encoding_order": ["no masks", "octave by octave", "sines first", "coordinate by coordinate"],
+    "occlusion_range": [
+        "no occlusion loss", *(f"occlusion, samples={s}" for s in (5, 10, 20, 40)),
+        "FreeNeRF's, weight 0.01, samples=20", "occlusion, distance=0.1", "occlusion, distance=0.3",
+    ],
+    "printed_mask": ["few_tensorf", "few_tensorf_printed", "few_tensorf_authors", "no masks"],
+    "smoke": ["no masks", "quick", "quick - RandomBackground"],
+}  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def scenes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Folders of scenes; reading a study does not look into them."""
+    for scene in SCENES:
+        (tmp_path / "nerf_synthetic" / scene).mkdir(parents=True)
+    for subject in ("subject_a", "subject_b"):
+        (tmp_path / "human" / subject).mkdir(parents=True)
+    monkeypatch.setenv("GRIDREG_DATA", str(tmp_path))
+    return tmp_path
+
+
+def of(name: str) -> Study:
+    return load_study(STUDIES / f"{name}.yaml")
+
+
+def row(study: Study, label: str) -> RunSpec:
+    return next(run for run in study.runs if run.label == label)
+
+
+def masks(run: RunSpec) -> dict[str, Any]:
+    """Frequency masks of a run by site."""
+    found = [r for r in run.config["composition"] if r["name"] == "FrequencyMask"]
+    return {r["site"] if isinstance(r["site"], str) else json.dumps(r["site"]): r for r in found}
+
+
+def test_every_study_is_listed_here() -> None:
+    assert {path.stem for path in PATHS} == set(ROWS)
+
+
+@pytest.mark.parametrize("path", PATHS, ids=lambda path: path.stem)
+def test_rows_and_runs(path: Path) -> None:
+    study = load_study(path)
+    assert list(study.labels) == ROWS[path.stem]
+    assert study.baseline in study.labels
+    assert study.title != study.name == path.stem
+    # Every row is another run, and every row has the same number of them.
+    assert len(set(study.hashes)) == len(study.runs)
+    assert len({len([run for run in study.runs if run.label == label]) for label in study.labels}) == 1
+
+
+@pytest.mark.parametrize("path", PATHS, ids=lambda path: path.stem)
+def test_regularizers_fit_the_field(path: Path) -> None:
+    """Applied to a small field of the run's kind, so that no row dies at its first step."""
+    done = set()
+    bounds = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+    for run in load_study(path).runs:
+        config = run.config
+        key = json.dumps([config["backbone"], config["field"], config["composition"]], sort_keys=True)
+        if key in done:
+            continue
+        done.add(key)
+        generator = torch.Generator().manual_seed(0)
+        field = make_field(config["backbone"], bounds, (8, 8, 8), generator=generator, **config["field"])
+        regularizers = gridreg.from_config(config["composition"])
+        with gridreg.apply(field, *regularizers, total_steps=config["train"]["steps"]) as handle:
+            handle.step(config["train"]["steps"] // 10)
+            assert len(handle.regularizers) == len(config["composition"])
+    assert len(done) >= len(set(ROWS[path.stem])) - 2
+
+
+def test_table_1_is_all_compositions_on_eight_views() -> None:
+    study = of("table1")
+    named = {run.label.removesuffix(" on VM") for run in study.runs}
+    assert named == set(gridreg.composition_names())
+    assert {run.scene_name for run in study.runs} == set(SCENES)
+    assert {(run.protocol, run.views) for run in study.runs} == {("dietnerf8", 8)}
+    assert len(study.runs) == 10 * 8 * 3
+    assert (row(study, "freenerf").backbone, row(study, "freenerf on VM").backbone) == ("mlp", "vm")
+
+
+def test_table_2_has_the_papers_numbers_of_iterations() -> None:
+    steps = {run.label: run.config["train"]["steps"] for run in of("table2").runs}
+    assert list(steps.values()) == [15_000, 15_000, 10_000, 15_000, 50_000]
+    assert all(max(run.config["train"]["evaluate_at"]) < steps[run.label] for run in of("table2").runs)
+
+
+def test_table_3_is_bodies_from_50_and_8_images() -> None:
+    study = of("table3")
+    assert {(run.scene_name, run.protocol, run.views) for run in study.runs} == {
+        (f"subject_{letter}", f"human{views}", views) for letter in "ab" for views in (8, 50)
+    }
+    fixed = [r for r in row(study, "fixed ratio 0.8").config["composition"] if r["name"] == "FixedMask"]
+    assert {r["site"] for r in fixed} == set(masks(row(study, "few_tensorf")))
+    assert {r["visible_ratio"] for r in fixed} == {0.8}
+    assert not masks(row(study, "fixed ratio 0.8"))
+
+
+def test_figure_3_has_three_numbers_of_views() -> None:
+    assert sorted({run.views for run in of("figure3").runs}) == [3, 10, 100]
+
+
+def test_masks_by_site_differ_in_the_masks_alone() -> None:
+    study = of("masks_by_site")
+    encodings = {f"encoding.{part}" for part in ("features", "direction", "position")}
+    expected = {
+        "no masks": set(),
+        "density": {"density"},
+        "appearance": {"appearance"},
+        "encodings": encodings,
+        "all": {"density", "appearance", *encodings},
+    }
+    rest = []
+    for label, sites in expected.items():
+        run = row(study, label)
+        assert set(masks(run)) == sites
+        assert {mask["until"] for mask in masks(run).values()} <= {0.2}
+        others = [r for r in run.config["composition"] if r["name"] != "FrequencyMask"]
+        rest.append(json.dumps([sorted(others, key=json.dumps), run.config["train"], run.config["field"]]))
+    assert len(set(rest)) == 1
+    assert {(run.scene_name, run.seed) for run in study.runs} == {
+        (s, n) for s in ("lego", "chair") for n in range(3)
+    }
+    assert {run.preset for run in study.runs} == {"quick"}
+    assert len(study.runs) == 30
+
+
+@pytest.mark.parametrize(
+    ("name", "argument", "values"),
+    [("end_of_schedule", "until", [0.1, 0.2, 0.5, 0.7, 0.9, 1.0]), ("block_size", "block", [1, 3, 5, 8, 16])],
+)
+def test_sweeps_set_their_argument(name: str, argument: str, values: list[float]) -> None:
+    study = of(name)
+    for value in values:
+        found = masks(row(study, f"masks, {argument}={value}"))
+        assert set(found) == {"density", "appearance"}
+        assert {mask[argument] for mask in found.values()} == {value}
+
+
+def test_occlusion_is_a_count_or_a_length() -> None:
+    study = of("occlusion_range")
+    for label in study.labels[1:]:
+        (loss,) = [r for r in row(study, label).config["composition"] if r["name"] == "OcclusionLoss"]
+        kind, _, value = label.rpartition("=")
+        wanted = {"samples": None, "distance": None, kind.split()[-1]: float(value)}
+        assert {key: loss[key] for key in wanted} == wanted
+    assert not [r for r in row(study, study.baseline).config["composition"] if r["name"] == "OcclusionLoss"]
+
+
+def test_orders_of_encodings_open_what_they_say() -> None:
+    """Half-way, the mask of the direction's columns: low frequencies, or every sine, or some axes."""
+    study = of("encoding_order")
+    bounds = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+    opened = {}
+    for label in study.labels[1:]:
+        config = row(study, label).config
+        field = make_field(
+            "vm", bounds, (8, 8, 8), generator=torch.Generator().manual_seed(0), **config["field"]
+        )
+        handle = gridreg.apply(field, *gridreg.from_config(config["composition"]), total_steps=1000)
+        handle.step(250)
+        direction, position = handle.masks().values()
+        # The columns of the first weight: 135 for the features, then direction and position.
+        assert direction.shape == position.shape == (213,)
+        assert (direction[:135] == 1).all()
+        assert (direction[174:] == 1).all()
+        assert (position[:174] == 1).all()
+        assert torch.equal(direction[135:174], position[174:])
+        opened[label] = position[174:]
+    # x y z, then for each of 6 octaves three sines and three cosines.
+    bands = opened["octave by octave"][3:].reshape(6, 2, 3)
+    assert (bands[:3] == 1).all()
+    assert (bands[4:] == 0).all()
+    waves = opened["sines first"][3:].reshape(6, 2, 3)
+    assert (waves[:, 0] == 1).all()
+    assert (waves[1:, 1] == 0).all()
+    axes = opened["coordinate by coordinate"].reshape(13, 3)
+    assert (axes[:, :2] == 1).all()
+    assert (axes[:, 2] == 0.5).all()
+
+
+def test_printed_masks_are_a_variant_alone() -> None:
+    study = of("printed_mask")
+    variants = {label: {m["variant"] for m in masks(row(study, label)).values()} for label in study.labels}
+    assert variants == {
+        "few_tensorf": {"block"},
+        "few_tensorf_printed": {"printed"},
+        "few_tensorf_authors": {"authors"},
+        "no masks": set(),
+    }
+
+
+def test_page_lists_the_studies() -> None:
+    page = (STUDIES.parent.parent / "docs" / "ablation-report.md").read_text(encoding="utf-8")
+    assert set(re.findall(r"^\| `(\w+)\.yaml` \|", page, re.M)) == set(ROWS)
+
+
+def test_smoke_is_small_and_of_the_built_in_scene() -> None:
+    study = of("smoke")
+    assert {run.scene for run in study.runs} == {None}
+    assert max(run.config["train"]["steps"] for run in study.runs) <= 100
+    assert all(run.size == 40 for run in study.runs)
