@@ -142,6 +142,16 @@ def test_noise_is_said_and_nothing_is_set_in_bold(made: tuple[Path, Results]) ->
     assert "one pair: no interval" in text
 
 
+def test_an_interval_that_leaves_the_picture_has_an_arrow(tmp_path: Path) -> None:
+    runs = [spec(label, seed=seed) for label in ("few_tensorf", "tensorf", "none") for seed in range(2)]
+    figures = {"few_tensorf": (25.0, 25.0), "tensorf": (25.3, 24.8), "none": (25.1, 25.11)}
+    results = [done(run, psnr=figures[run.label][run.seed]) for run in runs]
+    text = write_report(Results(results), study_of(runs), tmp_path / "r.html").read_text()
+    wide, narrow = re.findall(r'role="listitem">.*?</div>', text, re.S)
+    assert wide.count('class="arrow"') == 2
+    assert 'class="arrow"' not in narrow
+
+
 def test_scores_of_pictures_are_those_of_their_views(made: tuple[Path, Results]) -> None:
     sections = pictures_of(made[0])
     assert [sorted({entry["scene"] for entry in section}) for section in sections] == [

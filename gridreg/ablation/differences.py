@@ -66,11 +66,16 @@ def _forest_line(row: Row, across: Callable[[float], float], background: str) ->
         parts.append(
             f'<line class="interval" x1="{across(found.low):.2f}%" x2="{across(found.high):.2f}%" y1="15" y2="15"/>'
         )
+        # An arrow says that the interval goes on beyond the picture.
+        for end, arrow in ((found.low, "M8-5 0 0 8 5"), (found.high, "M-8-5 0 0-8 5")):
+            if (x := across(end)) in (0.0, 100.0):
+                parts.append(f'<svg x="{x:.0f}%" y="15" class="only"><path class="arrow" d="{arrow}"/></svg>')
         parts.append(f'<circle class="mean" cx="{across(found.mean):.2f}%" cy="15" r="5"/>')
         text = f"{signed(found.mean)} [{signed(found.low)}, {signed(found.high)}]"
     else:
-        x = f"{across(found.mean):.2f}%"
-        parts.append(f'<svg x="{x}" y="15" class="only"><path class="mean" d="M0-6 6 0 0 6-6 0Z"/></svg>')
+        parts.append(
+            f'<svg x="{across(found.mean):.2f}%" y="15" class="only"><path class="mean" d="M0-6 6 0 0 6-6 0Z"/></svg>'
+        )
         text = f"{signed(found.mean)}, one pair: no interval"
     sign = SIGNS.get(row.outcome, "") if found.half_width is not None else ""
     count = f"n = {found.count}" if found.count > 1 else ""
