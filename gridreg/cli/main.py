@@ -114,7 +114,7 @@ def overview() -> str:
             "",
             "gridreg COMMAND --help    options with units and defaults",
             "gridreg --version",
-            "gridreg --tyro-print-completion bash|zsh|tcsh    completion for a shell, to be sourced",
+            "gridreg --tyro-print-completion bash|zsh    completion for a shell, to be sourced",
             "",
             "From pictures of your own:",
             "  gridreg prepare PICTURES SCENE",

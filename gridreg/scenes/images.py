@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import ExifTags, Image
 
 from gridreg.errors import InputError
 from gridreg.scenes.png16 import decode_png16, is_png16
@@ -162,7 +162,8 @@ def copy_upright(
 ) -> tuple[int, int]:
     """Copy an image to where nothing but its pixels says which way is up, and return its width and height.
 
-    Bytes are copied where they can be; a JPEG that is stored turned is encoded anew at quality 95.
+    Bytes are copied where they can be; a JPEG that is stored turned is encoded anew at quality 95, and keeps of its
+    EXIF data what tells the focal length.
 
     Args:
         path: the image.
@@ -178,15 +179,28 @@ def copy_upright(
         with Image.open(io.BytesIO(data)) as opened:
             image, anew = _turned(opened, path, stated, as_stored)
             size = image.size
+            exif = _lens_notes(opened)
             if anew:
                 image.info.clear()
     except _DECODER_ERRORS as error:
         raise _not_whole(path, error) from None
     if anew:
-        image.save(target, quality=95)
+        image.save(target, quality=95, exif=exif)
     else:
         target.write_bytes(data)
     return size
+
+
+def _lens_notes(image: Image.Image) -> Image.Exif:
+    """Of a picture's EXIF data what tells the focal length in pixels: structure from motion starts from it."""
+    old, new = image.getexif(), Image.Exif()
+    new.update({tag: old[tag] for tag in (ExifTags.Base.Make, ExifTags.Base.Model) if tag in old})
+    noted = old.get_ifd(ExifTags.IFD.Exif)
+    lens = (ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm)
+    kept = {tag: noted[tag] for tag in lens if tag in noted}
+    if kept:
+        new[ExifTags.IFD.Exif] = kept
+    return new
 
 
 def area_mean(image: NDArray[np.float32], factor: int) -> NDArray[np.float32]:

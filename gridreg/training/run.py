@@ -148,7 +148,10 @@ def load_run(folder: str | Path) -> LoadedRun:
         InputError: if there is none, or it is damaged.
     """
     path = Path(folder)
-    path = path / "checkpoint" if has_checkpoint(path / "checkpoint") else path
+    if has_checkpoint(path / "checkpoint"):
+        path = path / "checkpoint"
+    elif path.is_dir() and not (path / "state.json").exists() and not (path / "tensors.safetensors").exists():
+        raise InputError(f"{path}: holds no checkpoint, expected the output folder of a run")
     saved = load_checkpoint(path)
     config = from_data(RunConfig, saved.config, source=str(path))
     state = saved.state["trainer"]
