@@ -10,14 +10,7 @@ import sys
 import tyro
 
 from gridreg.ablation.command import AblationOptions, run
-from gridreg.errors import InputError
+from gridreg.cli.ending import ending
 
 if __name__ == "__main__":
-    try:
-        sys.exit(run(tyro.cli(AblationOptions)))
-    except KeyboardInterrupt:
-        print("stopped; the same command goes on from here", file=sys.stderr)
-        sys.exit(130)
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+    sys.exit(ending(lambda: run(tyro.cli(AblationOptions))))

@@ -24,10 +24,8 @@ set:
   train.occupancy_resolution: 12
   train.carve: false
   field.width: 8
-  field.decoder: sh
   field.density_components: 4
   field.appearance_components: 4
-  field.initial_opacity: null
 """
 
 

@@ -8,13 +8,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from tests.ablation_runs import spec, study_of
 from hypothesis import given
 from hypothesis import strategies as st
 
 from gridreg.ablation import records
 from gridreg.ablation.records import RunResult, RunSpec
 from gridreg.errors import InputError
+from tests.ablation_runs import spec, study_of
 
 CONFIG = {
     "preset": "quick",

@@ -88,22 +88,24 @@ def scene_key(spec: RunSpec) -> tuple[Any, ...]:
 
 
 def locate_scene(path: str) -> Path:
-    """Where a scene lies on this machine: at its path, or by its name below the folder in GRIDREG_DATA.
+    """Where a scene lies on this machine: at its path, or by the end of its path below the folder in GRIDREG_DATA.
 
     Raises:
         InputError: if it is at neither.
     """
     data = os.environ.get(DATA_VARIABLE)
-    places = [Path(path), *([Path(data) / Path(path).name] if data else [])]
-    for place in places:
+    parts = Path(path).parts
+    # On another machine the same tree of scenes may begin elsewhere: name, then folder and name, and so on.
+    below = [Path(data, *parts[-count:]) for count in range(1, len(parts))] if data else []
+    for place in (Path(path), *below):
         if place.is_dir():
             return place
-    looked = " nor ".join(str(place) for place in places)
+    hint = (
+        f"{data} ({DATA_VARIABLE}) holds none of this name either" if data else f"{DATA_VARIABLE} is not set"
+    )
     raise InputError(
-        f"scene {Path(path).name}: not on {platform.node()}: found neither {looked}"
-        if len(places) > 1
-        else f"scene {Path(path).name}: not on {platform.node()}: found no folder {looked}; expected it there, or its "
-        f"parent in {DATA_VARIABLE}, or scenes shipped with the run"
+        f"scene {Path(path).name}: not on {platform.node()}: found no folder {path}, and {hint}; expected it there, "
+        "or scenes shipped with the run"
     )
 
 

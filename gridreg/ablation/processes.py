@@ -68,6 +68,7 @@ class Processes:
                     follower.follow()
                     for child in [c for c in children if c.process.poll() is not None]:
                         children.remove(child)
+                        _close(child)
                         if child.process.returncode == 0:
                             continue
                         worked = follower.has_worked(child.worker)
@@ -111,7 +112,6 @@ class Processes:
         status = child.process.returncode
         reason = f"signal {-status}" if status < 0 else f"exit status {status}"
         store.lose(child.worker, reason)
-        _close(child)
         if idle_deaths >= _MOST_IDLE_DEATHS:
             raise InputError(
                 f"workers: {idle_deaths} processes in a row died before they had done anything ({reason}); "

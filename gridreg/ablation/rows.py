@@ -106,7 +106,8 @@ def expand_rows(entry: Any) -> list[Row]:
     else:
         rows = _GENERATORS[kind](entry)
     common = _common(entry)
-    return [replace(row, **{**_kept(row), **common}) for row in rows]
+    # What a sweep varies stands above what the entry sets.
+    return [replace(row, **{**common, "set": {**common.get("set", {}), **row.set}}) for row in rows]
 
 
 def _kind_of(entry: Any) -> str:
@@ -264,10 +265,6 @@ def _parts(entry: Mapping[str, Any], plain: Plain) -> dict[str, Plain]:
 def _without(plain: Plain, part: Plain) -> Plain:
     titles = [title_of(regularizer) for regularizer in part]
     return [r for r in plain if not (title_of(r) in titles and r in part)]
-
-
-def _kept(row: Row) -> dict[str, Any]:
-    return {"preset": row.preset, "backbone": row.backbone, "steps": row.steps, "set": row.set}
 
 
 def _common(entry: Any) -> dict[str, Any]:

@@ -32,6 +32,7 @@ from gridreg.ablation.records import RunSpec, Study
 from gridreg.ablation.rows import Row, expand_rows
 from gridreg.ablation.study_file import StudyFile
 from gridreg.errors import InputError
+from gridreg.fields import field_names
 from gridreg.scenes.protocols import Every, Listed, Protocol, get_protocol
 from gridreg.training.config import from_data, override, to_data
 from gridreg.training.options import TrainOptions, configure
@@ -126,7 +127,8 @@ def _runs(file: StudyFile, rows: Sequence[Row], scenes: Sequence[Path | None]) -
     for row in rows:
         presets = [row.preset] if row.preset else file.presets
         for preset in presets:
-            backbones = [row.backbone] if row.backbone else (file.backbones or [load_preset(preset).backbone])
+            own = _backbone_of(preset, "compositions" if row.preset else "presets")
+            backbones = [row.backbone] if row.backbone else (file.backbones or [own])
             for backbone in backbones:
                 marks = [preset] * (len(presets) > 1) + [backbone] * (len(backbones) > 1)
                 label = f"{row.label} [{', '.join(marks)}]" if marks else row.label
@@ -163,8 +165,20 @@ def _row_runs(file: StudyFile, label: str, config: RunConfig, scenes: Sequence[P
     return runs
 
 
+def _backbone_of(preset: str, key: str) -> str:
+    try:
+        return load_preset(preset).backbone
+    except InputError as error:
+        raise InputError(f"{key}: {error}") from None
+
+
 def _config(file: StudyFile, row: Row, preset: str, backbone: str) -> RunConfig:
     """Preset, then field, composition, the study's values, the row's values, and the number of steps."""
+    if backbone not in field_names():
+        key = "compositions" if row.backbone else "backbones"
+        raise InputError(
+            f"{key}: found the backbone {backbone!r}, expected one of {', '.join(field_names())}"
+        )
     config = configure(TrainOptions(preset=preset, backbone=backbone))
     config = dataclasses.replace(config, composition=row.composition(config.composition))
     for key, changes in (("set", file.set), ("compositions", row.set)):
