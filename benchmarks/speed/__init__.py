@@ -1,0 +1,1 @@
+"""What training and rendering cost: see docs/speed.md."""

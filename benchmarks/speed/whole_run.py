@@ -1,0 +1,153 @@
+"""A whole run in a process of its own, whose memory is then the run's."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from gridreg.errors import InputError
+from gridreg.rendering.backends import use_backend
+from gridreg.training import Execution, StepReport, TrainSettings, execute
+from gridreg.training.files import write_json
+
+from . import common
+from .common import Record
+
+PROGRAM = Path(__file__).parents[1] / "speed.py"
+
+
+def peak_bytes(status: Path = Path("/proc/self/status")) -> int:
+    """The most memory that this process has held.
+
+    ``ru_maxrss`` of a process also counts what its parent held when it was started, so Linux's own count for the
+    program comes first.
+    """
+    try:
+        lines = status.read_text().splitlines()
+    except OSError:
+        lines = []
+    for line in lines:
+        if line.startswith("VmHWM:"):
+            return 1024 * int(line.split()[1])
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return most if sys.platform == "darwin" else 1024 * most
+
+
+def boundaries(settings: TrainSettings) -> list[int]:
+    """Iterations at which the schedule changes the grid, its cells or its rays, and both ends."""
+    inside = {*settings.resample_at, *settings.occupancy_at, *settings.shrink_at, *settings.filter_rays_at}
+    return sorted({0, settings.steps, *(step for step in inside if 0 < step < settings.steps)})
+
+
+class Spans:
+    """Notes time, grid and memory at the boundaries of a schedule, while `gridreg.training.execute` trains."""
+
+    def __init__(self, settings: TrainSettings) -> None:
+        self.ends = boundaries(settings)[1:]
+        self.rows: list[Record] = []
+
+    def start(self, run: Execution) -> None:
+        self.run, self.began, self.first = run, time.perf_counter(), run.trainer.step
+        self.resolution = list(getattr(run.trainer.field, "resolution", ()))
+
+    def step(self, report: StepReport) -> None:
+        step = self.run.trainer.step
+        if step not in self.ends:
+            return
+        now = time.perf_counter()
+        self.rows.append(
+            {
+                "from": self.first,
+                "to": step,
+                "resolution": self.resolution,
+                "seconds": now - self.began,
+                "peak_bytes": peak_bytes(),
+            }
+        )
+        self.first, self.began = step, now
+        # The events of this iteration have been, so this is the grid of the next span.
+        self.resolution = list(getattr(self.run.trainer.field, "resolution", ()))
+
+
+def add_arguments(parser: argparse.ArgumentParser, preset: str) -> None:
+    common.add_scene_arguments(parser, preset=preset)
+    parser.add_argument("--backend", choices=("auto", "torch"), default="auto", help="torch: the plain path")
+
+
+def run_here(arguments: argparse.Namespace) -> Record:
+    """Train and score in this process; figures by span of the schedule, scores and memory."""
+    peaks = {"imports": peak_bytes()}
+    config = common.configuration(arguments, arguments.steps)
+    scene = common.scene_of(config)
+    peaks["scene"] = peak_bytes()
+    spans = Spans(config.train)
+    with tempfile.TemporaryDirectory() as out, use_backend(arguments.backend):
+        _, metrics = execute(config, scene, out, watch=spans)
+    if metrics is None:
+        raise KeyboardInterrupt
+    peaks["training"] = spans.rows[-1]["peak_bytes"]
+    peaks["scoring"] = peak_bytes()
+    return {
+        "scene": metrics["scene"],
+        "protocol": metrics["protocol"],
+        "preset": arguments.preset,
+        "steps": metrics["steps"],
+        "seed": metrics["seed"],
+        "mean": metrics["mean"],
+        "seconds": metrics["seconds"],
+        "test_views": len(metrics["images"]),
+        "spans": spans.rows,
+        "peak_bytes": peaks,
+    }
+
+
+def run_apart(arguments: argparse.Namespace) -> Record:
+    """`run_here` in a fresh process.
+
+    Raises:
+        InputError: what the process says when it ends badly.
+    """
+    # What is wrong with the command line shows here, at once.
+    common.configuration(arguments, arguments.steps)
+    with tempfile.TemporaryDirectory() as folder:
+        target = Path(folder) / "figures.json"
+        given = {k: v for k, v in vars(arguments).items() if k not in ("measure", "show", "results")}
+        plain: dict[str, Any] = {k: str(v) if isinstance(v, Path) else v for k, v in given.items()}
+        plain["threads"] = torch.get_num_threads()
+        ended = subprocess.run(
+            [sys.executable, str(PROGRAM), "run", "--given", json.dumps(plain), "--into", str(target)],
+            stderr=subprocess.PIPE if not sys.stderr.isatty() else None,
+            text=True,
+            check=False,
+        )
+        if ended.returncode == 130:
+            raise KeyboardInterrupt
+        if ended.returncode or not target.is_file():
+            lines = (ended.stderr or "").strip().splitlines()
+            said = lines[-1].removeprefix("error: ") if lines else f"status {ended.returncode}"
+            raise InputError(f"the run in a process of its own failed: {said}")
+        found: Record = json.loads(target.read_text())
+        return found
+
+
+def main(words: list[str]) -> int:
+    """The other side of `run_apart`."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--given", type=json.loads, required=True)
+    parser.add_argument("--into", type=Path, required=True)
+    options = parser.parse_args(words)
+    arguments = argparse.Namespace(**options.given)
+    if arguments.scene is not None:
+        arguments.scene = Path(arguments.scene)
+    torch.set_num_threads(arguments.threads)
+    write_json(options.into, run_here(arguments), sort_keys=False)
+    return 0
