@@ -1,0 +1,354 @@
+"""Formulas of the roofline against the same computations in numbers that count what is done with them."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from argparse import Namespace
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from gridreg.errors import InputError
+from gridreg.scenes import builtin_scene
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+from speed import common, machine, main, roofline, situations
+from speed.work import PARTS, Counts, Work, density_work, encoding_operations, layer_operations_backward, work
+
+COUNTS = Counts(
+    rays=5,
+    steps=70,
+    cells=27,
+    samples=11,
+    coloured=4,
+    density_channels=2,
+    appearance_channels=3,
+    density_nodes=13,
+    appearance_nodes=9,
+    features=4,
+    layers=(4 * 5 + 3 * 3 + 3 * 7, 6, 3),
+    encodings=((4, 2), (3, 1), (3, 3)),
+    parameters=50,
+    low=True,
+)
+
+
+class Number:
+    """A number that counts operations."""
+
+    done = 0
+
+    def __init__(self, value: float = 0.5) -> None:
+        self.value = value
+
+    def _next(self, value: float) -> Number:
+        Number.done += 1
+        return Number(value)
+
+    def __add__(self, other: Any) -> Number:
+        return self._next(self.value + _plain(other))
+
+    def __sub__(self, other: Any) -> Number:
+        return self._next(self.value - _plain(other))
+
+    def __rsub__(self, other: Any) -> Number:
+        return self._next(_plain(other) - self.value)
+
+    def __mul__(self, other: Any) -> Number:
+        return self._next(self.value * _plain(other))
+
+    __radd__, __rmul__ = __add__, __mul__
+
+    def __truediv__(self, other: Any) -> Number:
+        return self._next(self.value / _plain(other))
+
+    def __rtruediv__(self, other: Any) -> Number:
+        return self._next(_plain(other) / self.value)
+
+    def f(self) -> Number:
+        """A root or a function of the exponential's kind."""
+        return self._next(self.value)
+
+
+def _plain(x: Any) -> float:
+    return x.value if isinstance(x, Number) else x
+
+
+@pytest.fixture(autouse=True)
+def from_zero() -> None:
+    Number.done = 0
+
+
+def numbers(count: int) -> list[Number]:
+    return [Number() for _ in range(count)]
+
+
+def place() -> tuple[list[Number], list[list[Number]], list[Number]]:
+    """In the box, on the grid; shares, corners of three planes, and complements."""
+    u = [(x - 0.1) / 0.7 for x in numbers(3)]
+    shares = [x - math.floor(x.value) for x in (a * 7 for a in u)]
+    rests = [1 - s for s in shares]
+    corners = []
+    for a, b in ((0, 1), (0, 2), (1, 2)):
+        corners.append(
+            [rests[a] * rests[b], rests[a] * shares[b], shares[a] * rests[b], shares[a] * shares[b]]
+        )
+    return shares, corners, rests
+
+
+def plane_value(corners: list[Number]) -> Number:
+    p = numbers(4)
+    return p[0] * corners[0] + p[1] * corners[1] + p[2] * corners[2] + p[3] * corners[3]
+
+
+def line_value(share: Number, rest: Number) -> Number:
+    low, high = numbers(2)
+    return low * rest + high * share
+
+
+def products(channels: int) -> list[Number]:
+    shares, corners, rests = place()
+    return [
+        plane_value(corners[k]) * line_value(shares[2 - k], rests[2 - k])
+        for k in range(3)
+        for _ in range(channels)
+    ]
+
+
+def add_gradients(channels: int, upstream: list[Number]) -> None:
+    shares, corners, rests = place()
+    for k in range(3):
+        for c in range(channels):
+            g = upstream[k * channels + c]
+            on_plane = line_value(shares[2 - k], rests[2 - k]) * g
+            on_line = plane_value(corners[k]) * g
+            for weight in corners[k]:
+                Number() + on_plane * weight
+            Number() + on_line * rests[2 - k]
+            Number() + on_line * shares[2 - k]
+
+
+def test_density_by_counting() -> None:
+    features = products(COUNTS.density_channels)
+    total = features[0]
+    for one in features[1:]:
+        total = total + one
+    ((total + -10.0).f() + 1).f() * 25.0
+    assert work(COUNTS)["density"].operations == COUNTS.samples * Number.done
+
+
+def test_appearance_by_counting() -> None:
+    products(COUNTS.appearance_channels)
+    assert work(COUNTS)["colour/lookup"].operations == COUNTS.coloured * Number.done
+
+
+def test_backward_lookups_by_counting() -> None:
+    add_gradients(COUNTS.appearance_channels, numbers(9))
+    assert work(COUNTS)["backward/lookup"].operations == COUNTS.coloured * Number.done
+    Number.done = 0
+    upstream = Number() * ((Number() / -25.0).f() * -25.0)
+    add_gradients(COUNTS.density_channels, [upstream] * 6)
+    assert work(COUNTS)["backward/density"].operations == COUNTS.samples * Number.done
+
+
+def encode(dims: int, octaves: int) -> None:
+    for x in numbers(dims):
+        if octaves:
+            sine, cosine = x.f(), x.f()
+        for _ in range(octaves - 1):
+            doubled = 2 * sine
+            sine, cosine = doubled * cosine, 1 - doubled * sine
+
+
+def multiply(rows: int, columns: int) -> None:
+    """One row times a matrix, with a bias."""
+    for _ in range(columns):
+        total = Number()
+        for x in numbers(rows):
+            total = total + x * Number()
+
+
+def test_network_by_counting() -> None:
+    c = COUNTS
+    multiply(3 * c.appearance_channels, c.features)
+    encode(*c.encodings[0])
+    encode(*c.encodings[2])
+    for x in numbers(3):
+        1 / (1 + x.f())
+    by_sample = Number.done
+    Number.done = 0
+    encode(*c.encodings[1])
+    by_ray = Number.done
+    assert encoding_operations(*c.encodings[1]) == by_ray
+    Number.done = 0
+    multiply(c.layers[0], c.layers[1])
+    multiply(c.layers[1], c.layers[2])
+    found = work(c)["colour/network"]
+    assert found.operations == c.coloured * by_sample + c.rays * by_ray
+    assert found.low == c.coloured * Number.done
+    single = work(replace(c, low=False))["colour/network"]
+    assert (single.operations, single.low) == (found.operations + found.low, 0)
+
+
+def test_network_backward_by_counting() -> None:
+    c = COUNTS
+    wide, hidden, out = c.layers
+    wanted = c.encodings[0][0] * (1 + 2 * c.encodings[0][1])
+    # Gradients of weights are products of a column and a row; of inputs, products with the matrix.
+    for rows, columns, back in ((wide, hidden, wanted), (hidden, out, hidden)):
+        for _ in range(rows * columns):
+            Number() + Number() * Number()
+        multiply(columns, back)
+    assert layer_operations_backward(c.layers, wanted) == Number.done
+    assert work(c)["backward/network"].low == c.coloured * Number.done
+    Number.done = 0
+    for _ in range(3 * c.appearance_channels * c.features):
+        Number() + Number() * Number()
+    multiply(c.features, 3 * c.appearance_channels)
+    for _ in range(c.encodings[0][0] * c.encodings[0][1]):
+        sine, cosine, of_sine, of_cosine = numbers(4)
+        Number() + 2.0 * (cosine * of_sine - sine * of_cosine)
+    assert work(c)["backward/network"].operations == c.coloured * Number.done
+
+
+def test_march_and_compositing_by_counting() -> None:
+    t = Number() + (Number() + 0.5) * 0.1
+    for origin, direction in zip(numbers(3), numbers(3), strict=True):
+        origin + t * direction
+    assert work(COUNTS)["march"].operations == COUNTS.samples * Number.done
+    Number.done = 0
+    through = (Number() * -0.1).f()
+    weight = Number() * (1 - through)
+    Number() * through
+    _ = Number() + weight * t, Number() + weight
+    by_sample = Number.done
+    Number.done = 0
+    _ = [Number() + weight * x for x in numbers(3)]
+    by_colour = Number.done
+    Number.done = 0
+    rest = 1 - Number()
+    _ = [Number() + rest * x for x in numbers(3)]
+    expected = COUNTS.samples * by_sample + COUNTS.coloured * by_colour + COUNTS.rays * Number.done
+    assert work(COUNTS)["compositing"].operations == expected
+
+
+def test_optimiser_by_counting() -> None:
+    m, v, g = numbers(3)
+    m = m + 0.1 * (g - m)
+    v = 0.99 * v + 0.01 * (g * g)
+    Number() - 0.02 * (m / (v.f() * 1.1 + 1e-8))
+    assert work(COUNTS)["optimiser"].operations == COUNTS.parameters * Number.done
+    assert work(COUNTS)["optimiser"].bytes == COUNTS.parameters * 2 * 4 * 4
+
+
+def test_bytes_of_lookups_by_hand() -> None:
+    # Two samples, one channel: 2 x 12 bytes of positions, 2 x 4 of densities, and 5 nodes of 4 bytes.
+    assert density_work(2, 1, 5).bytes == 24 + 8 + 20
+    # Through the caches every sample reads 4 nodes of three planes and 2 of three lines.
+    assert density_work(2, 1, 5).cached == 24 + 8 + 2 * 3 * 6 * 4
+    found = work(COUNTS)
+    c = COUNTS
+    row = 3 * c.appearance_channels * 4
+    assert (
+        found["colour/lookup"].bytes
+        == c.coloured * (12 + row) + c.appearance_nodes * c.appearance_channels * 4
+    )
+    gradients = 3 * c.appearance_nodes * c.appearance_channels * 4
+    assert found["backward/lookup"].bytes == c.coloured * (12 + row) + gradients
+    assert found["march"].bytes == 5 * 36 + 6 * 8 + 27 + 11 * 24
+    weights = 9 * 4 + c.layers[0] * 6 + 6 * 3
+    assert found["colour/network"].bytes == c.coloured * (row + 32) + 4 * weights
+    assert list(found) == list(PARTS)
+
+
+def test_touched_nodes_against_sets() -> None:
+    resolution = (4, 5, 3)
+    generator = torch.Generator().manual_seed(0)
+    u = torch.cat([torch.rand(6, 3, generator=generator), torch.tensor([[0.0, 1.0, 1.0], [1.0, 0.0, 0.5]])])
+    nodes = set()
+    for point in u.tolist():
+        below = [min(int(x * (n - 1)), n - 2) for x, n in zip(point, resolution, strict=True)]
+        for a, b in ((0, 1), (0, 2), (1, 2)):
+            nodes |= {(a, b, below[a] + i, below[b] + j) for i in (0, 1) for j in (0, 1)}
+        nodes |= {(axis, below[axis] + i) for axis in range(3) for i in (0, 1)}
+    assert roofline.touched_nodes(u, resolution) == len(nodes)
+    assert roofline.touched_nodes(u[:0], resolution) == 0
+
+
+def test_bounds_and_account() -> None:
+    rates = machine.Machine(memory=10.0, cache=20.0, float32=4.0, bfloat16=8.0)
+    found = roofline.bounds(Work(bytes=50, operations=8, low=8, cached=120), rates)
+    assert found == {"memory": 5.0, "arithmetic": 3.0, "roof": 5.0, "cached": 6.0}
+    figures = roofline.account(COUNTS, {"optimiser": 500.0, "march": 100.0}, rates, whole=1000.0)
+    assert figures["rows"]["optimiser"]["seconds"] == 500.0
+    assert figures["share"] == pytest.approx(sum(row["roof"] for row in figures["rows"].values()) / 1000)
+    assert sum(figures["above"].values()) == pytest.approx(1000 - figures["roof"])
+    assert figures["above"]["between stages"] == 400
+
+
+def test_rates() -> None:
+    found = machine.measure(megabytes=1, size=32)
+    assert min(found.memory, found.cache, found.float32, found.bfloat16) > 1e6
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return builtin_scene(tmp_path_factory.mktemp("scenes"), size=16)
+
+
+SET = ["train.rays=32", "field.density_components=4", "field.appearance_components=6"]
+
+
+def test_counts_of_a_step(scene: Path) -> None:
+    changes = [*SET, "field.density_shift=-4.0", "train.weight_bound=0.001"]
+    arguments = Namespace(scene=scene, protocol=None, preset="few_tensorf", seed=0, set=changes)
+    config = common.configuration(arguments)
+    found = situations.early(config, common.scene_of(config, test=()), edge=8, warm_up=2)
+    counts = roofline.counts_of(found)
+    assert (counts.rays, counts.cells) == (32, 7**3)
+    assert 0 < counts.coloured <= counts.samples <= counts.steps
+    # The masks of the preset are at their beginning: a block of three channels is open, and the next begins to open.
+    assert (counts.density_channels, counts.appearance_channels) == (4, 6)
+    assert counts.density_nodes <= 3 * 64 + 3 * 8
+    assert counts.layers == (27 * 5 + 3 * 13 + 3 * 13, 128, 128, 3)
+    total = sum(p.numel() for p in found.trainer.field.parameters())
+    assert 0 < counts.parameters <= total
+    bare = replace(config, field={**config.field, "decoder": "sh"}, composition=[])
+    other = situations.early(bare, found.trainer.scene, edge=6, warm_up=1)
+    with pytest.raises(InputError, match="roofline: found a decoder without layers"):
+        roofline.counts_of(other)
+
+
+def test_roofline(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["roofline", "--scene", str(scene), "--early-edge", "8", "--only", "early", "--warm-up", "2"]
+    words += ["--repeats", "2", "--megabytes", "1", "--matrix", "32", "--threads", "1"]
+    words += [
+        "--results",
+        str(tmp_path),
+        "--set",
+        *SET,
+        "field.density_shift=-4.0",
+        "train.weight_bound=0.001",
+    ]
+    assert main.main(words) == 0
+    (stored,) = tmp_path.glob("roofline-*.json")
+    record = json.loads(stored.read_text())
+    (one,) = record["situations"]
+    assert list(one["rows"]) == list(PARTS)
+    assert 0 < one["share"] <= one["share_with_caches"]
+    assert one["rows"]["backward/lookup"]["seconds"] > 0
+    assert 0.8 < one["sum_of_stages"] <= 1
+    printed = capsys.readouterr().out
+    assert "| colour/network |" in printed
+    assert "Gflop/s" in printed
+
+
+def test_roofline_of_another_backbone_is_refused(scene: Path) -> None:
+    words = ["roofline", "--scene", str(scene), "--preset", "cp", "--only", "early", "--early-edge", "6"]
+    with pytest.raises(InputError, match="expected VMField"):
+        main.main([*words, "--repeats", "1", "--warm-up", "1", "--megabytes", "1", "--matrix", "8"])
