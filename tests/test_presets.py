@@ -156,3 +156,20 @@ def test_grid_rivals_differ_from_the_baseline_in_their_composition():
     for site in ("density", "appearance"):
         assert gridreg.SpatialAnnealing(site, until=0.8, start=0.15, rounds=30, rate=0.2) in kinds
     assert gridreg.ViewDependenceMask("view", bands=2) in kinds
+
+
+@pytest.mark.parametrize(
+    ("preset", "backbone", "like"),
+    [
+        ("quick", "cp", "cp_quick"),
+        ("few_tensorf", "cp", "cp"),
+        ("quick", "mlp", "freenerf_quick"),
+        ("few_tensorf", "mlp", "freenerf"),
+    ],
+)
+def test_another_backbone_comes_with_options_and_regularizers_that_fit_it(preset, backbone, like):
+    config, fitting = configure(TrainOptions(preset=preset, backbone=backbone)), load_preset(like)
+    assert config.train == load_preset(preset).train
+    assert (config.field, config.composition) == (fitting.field, fitting.composition)
+    own = configure(TrainOptions(preset=preset, backbone=backbone, composition="none"))
+    assert own.composition == "none"

@@ -81,8 +81,11 @@ def configure(options: TrainOptions) -> RunConfig:
     if options.scene is not None:
         changes["scene"] = str(options.scene)
     if options.backbone is not None and options.backbone != config.backbone:
-        # The options of one field mean nothing to another.
-        changes["field"] = _field_of(options.backbone)
+        # The options of one field mean nothing to another, nor do the names of its sites.
+        like = _preset_of(options.backbone, preset)
+        changes["field"] = like.field if like else {}
+        if like is not None:
+            changes.setdefault("composition", like.composition)
     config = override(config, {**changes, **assignments(options.set)})
     if options.steps is not None:
         if options.steps < 1:
@@ -95,13 +98,12 @@ def configure(options: TrainOptions) -> RunConfig:
     return config
 
 
-def _field_of(backbone: str) -> dict[str, Any]:
-    """The options of the first preset made for a backbone, or none."""
-    for name in preset_names():
-        preset = load_preset(name)
-        if preset.backbone == backbone:
-            return preset.field
-    return {}
+def _preset_of(backbone: str, like: str) -> RunConfig | None:
+    """A preset made for a backbone: the one that goes with a preset (``cp_quick`` with ``quick``), else the first."""
+    found = {name: load_preset(name) for name in preset_names()}
+    names = [name for name in found if found[name].backbone == backbone]
+    names.sort(key=lambda name: not name.endswith(f"_{like}"))
+    return found[names[0]] if names else None
 
 
 def output_folder(options: TrainOptions, config: RunConfig) -> Path:
