@@ -299,6 +299,8 @@ def test_two_scenes_of_one_name_are_refused(tmp_path):
             "compositions: [none]\nmodules: [no_such_module_here]",
             "modules: cannot import 'no_such_module_here'",
         ),
+        ("compositions: [none, few_tensorf]", r"row 'few_tensorf' with preset quick: .*encoding\.position"),
+        ("compositions: [none]\nset: {field.decoder: nonsense}", "row 'none' with preset quick: .*nonsense"),
         ("compositions: none", "expected a list"),
         ("compositions: [none", "not valid YAML"),
         ("- none", "expected a mapping"),
@@ -358,7 +360,7 @@ def test_the_tiny_study_of_these_tests():
     st.lists(st.integers(1, 18), min_size=1, max_size=3, unique=True),
 )
 def test_hashes_are_one_for_each_run(composition, seeds, views):
-    preset = "freenerf_quick" if composition == "freenerf" else "quick"
+    preset = {"few": "few_tensorf", "fre": "freenerf_quick"}.get(composition[:3], "quick")
     study = study_from_text(
         f"compositions: [{composition}]\npresets: [{preset}]\nseeds: {seeds}\nviews: {views}"
     )

@@ -28,6 +28,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from gridreg.ablation.fitting import check_fits
 from gridreg.ablation.records import RunSpec, Study
 from gridreg.ablation.rows import Row, expand_rows
 from gridreg.ablation.study_file import StudyFile
@@ -124,6 +125,7 @@ def _runs(file: StudyFile, rows: Sequence[Row], scenes: Sequence[Path | None]) -
         )
     runs: list[RunSpec] = []
     seen: dict[str, str] = {}
+    fitting: set[str] = set()
     for row in rows:
         presets = [row.preset] if row.preset else file.presets
         for preset in presets:
@@ -136,6 +138,10 @@ def _runs(file: StudyFile, rows: Sequence[Row], scenes: Sequence[Path | None]) -
                 content = str(to_data(config))
                 if seen.setdefault(label, content) != content:
                     raise InputError(f"compositions: two rows are called {label!r}; give one another label")
+                fit = str((config.backbone, config.field, config.composition))
+                if fit not in fitting:
+                    fitting.add(fit)
+                    _check_fits(label, config)
                 runs += _row_runs(file, label, config, scenes)
     unique = {(run.label, run.hash): run for run in runs}
     return list(unique.values())
@@ -163,6 +169,13 @@ def _row_runs(file: StudyFile, label: str, config: RunConfig, scenes: Sequence[P
                     )
                 )
     return runs
+
+
+def _check_fits(label: str, config: RunConfig) -> None:
+    try:
+        check_fits(config)
+    except InputError as error:
+        raise InputError(f"compositions: row {label!r} with preset {config.preset}: {error}") from None
 
 
 def _backbone_of(preset: str, key: str) -> str:
