@@ -34,11 +34,10 @@ Array = NDArray[np.float64]
 
 
 def poses_around(count: int) -> list[Array]:
-    """Cameras as a person walks around: three rings at 10, 30 and 50 degrees, neighbours close to each other."""
-    rings = [(10.0, round(0.4 * count)), (30.0, round(0.35 * count))]
-    rings.append((50.0, count - sum(number for _, number in rings)))
+    """Cameras as a person walks around twice: rings at 20 and 42 degrees, the second between those of the first."""
+    rings = ((20.0, count - count // 2), (42.0, count // 2))
     return [
-        look_at_origin(360.0 * k / number + 7.0 * ring, elevation)
+        look_at_origin(360.0 * (k + 0.5 * ring) / number, elevation)
         for ring, (elevation, number) in enumerate(rings)
         for k in range(number)
     ]

@@ -12,7 +12,7 @@ from pathlib import Path
 import tyro
 
 from gridreg.cli import ending
-from gridreg.export import draw_run, live_view
+from gridreg.export import check_drawing, draw_run, live_view
 from gridreg.training import TrainOptions, configure, execute, open_scene, output_folder
 from gridreg.training.outputs import summary
 
@@ -21,6 +21,7 @@ def main(options: TrainOptions) -> int:
     """Train, score, draw."""
     with live_view(options.view, options.host, options.port) as look:
         config = configure(options)
+        check_drawing(video=options.video)
         out = output_folder(options, config)
         scene = open_scene(config, cache=Path("outputs"))
         print(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from gridreg.export import draw_run, live_view
+from gridreg.export import check_drawing, draw_run, live_view
 from gridreg.training import TrainOptions, configure, execute, open_scene, output_folder
 from gridreg.training.outputs import summary
 
@@ -20,6 +20,7 @@ def run(options: TrainOptions) -> int:
     """
     with live_view(options.view, options.host, options.port) as look:
         config = configure(options)
+        check_drawing(video=options.video)
         out = output_folder(options, config)
         scene = open_scene(config, cache=Path("outputs"))
         print(

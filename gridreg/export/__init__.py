@@ -7,7 +7,15 @@ from gridreg.export.compare import MeshComparison, compare_meshes
 from gridreg.export.mesh import Mesh, extract_mesh, read_mesh, save_mesh, write_mesh
 from gridreg.export.model import Model
 from gridreg.export.pictures import MODES, picture
-from gridreg.export.runs import LiveView, draw_run, film_path, live_view, model_of_run, model_of_trainer
+from gridreg.export.runs import (
+    LiveView,
+    check_drawing,
+    draw_run,
+    film_path,
+    live_view,
+    model_of_run,
+    model_of_trainer,
+)
 from gridreg.export.video import render_frames, render_video
 from gridreg.export.viewer import Viewer
 
@@ -23,6 +31,7 @@ __all__ = [
     "Orbit",
     "Viewer",
     "camera_path",
+    "check_drawing",
     "compare_meshes",
     "draw_run",
     "extract_mesh",

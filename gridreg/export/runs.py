@@ -16,12 +16,21 @@ from gridreg.export.mesh import write_mesh
 from gridreg.export.model import Model
 from gridreg.export.video import render_video
 from gridreg.export.viewer import Viewer
+from gridreg.export.writers import find_ffmpeg
 from gridreg.scenes import Views
 
 if TYPE_CHECKING:
     from gridreg.training import Execution, LoadedRun, StepReport, Trainer
 
-__all__ = ["LiveView", "draw_run", "film_path", "live_view", "model_of_run", "model_of_trainer"]
+__all__ = [
+    "LiveView",
+    "check_drawing",
+    "draw_run",
+    "film_path",
+    "live_view",
+    "model_of_run",
+    "model_of_trainer",
+]
 
 
 def model_of_run(run: LoadedRun) -> Model:
@@ -58,6 +67,19 @@ def film_path(
     if forward and views is None and name == "spiral":
         raise InputError("path 'spiral': needs the training cameras of the forward-facing scene")
     return camera_path(name, model.field.bounds, views, **options)
+
+
+def check_drawing(*, video: bool = True) -> None:
+    """Say before a training what `draw_run` would say after it.
+
+    Raises:
+        InputError: if a film is wanted and there is no ffmpeg.
+    """
+    if video:
+        try:
+            find_ffmpeg()
+        except InputError as error:
+            raise InputError(f"{error}; or train with --no-video") from None
 
 
 def draw_run(run: Execution, *, mesh: bool = True, video: bool = True) -> list[Path]:

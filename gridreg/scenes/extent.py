@@ -10,7 +10,15 @@ from numpy.typing import NDArray
 from gridreg.errors import InputError
 from gridreg.scenes.views import Scene
 
-__all__ = ["Extent", "blender_extent", "camera_extent", "check_box", "focus_point", "points_extent"]
+__all__ = [
+    "Extent",
+    "blender_extent",
+    "box_is_seen",
+    "camera_extent",
+    "check_box",
+    "focus_point",
+    "points_extent",
+]
 
 
 class Extent(NamedTuple):
@@ -118,26 +126,49 @@ def check_box(scene: Scene, points: NDArray[np.float64] | None = None) -> None:
     Raises:
         InputError: when no training camera sees the box between near and far, or it holds none of the points.
     """
-    low, high = scene.bounds.numpy().astype(np.float64)
+    bounds = scene.bounds.numpy().astype(np.float64)
+    low, high = bounds
     if points is not None and not ((points >= low) & (points <= high)).all(axis=1).any():
         raise InputError(
             f"bounds: the box {scene.bounds.tolist()} holds none of the scene's {len(points)} points"
         )
     if scene.ndc or not len(scene.train):
         return
+    poses, intrinsics = scene.train.poses.numpy(), scene.train.intrinsics.numpy()
+    extent = Extent(scene.near, scene.far, bounds)
+    if not box_is_seen(extent, poses, intrinsics, (scene.train.width, scene.train.height)):
+        raise InputError(
+            f"bounds: no training camera sees the box {scene.bounds.tolist()} between "
+            f"near {scene.near:g} and far {scene.far:g}"
+        )
+
+
+def box_is_seen(
+    extent: Extent, poses: NDArray[np.float64], intrinsics: NDArray[np.float64], size: tuple[int, int]
+) -> bool:
+    """Whether any camera sees some of a box between near and far.
+
+    Args:
+        extent: the box, near and far.
+        poses: ``(V, 4, 4)`` camera-to-world.
+        intrinsics: ``(V, 4)`` fx, fy, cx, cy in pixels.
+        size: width and height of the images in pixels.
+    """
+    low, high = extent.bounds
     steps = np.linspace(0, 1, 9)
     grid = low + np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3) * (high - low)
-    for pose, values in zip(scene.train.poses.numpy(), scene.train.intrinsics.numpy(), strict=True):
-        if _sees_points(grid, pose, values, scene) or _meets_box(low, high, pose, values, scene):
-            return
-    raise InputError(
-        f"bounds: no training camera sees the box {scene.bounds.tolist()} between "
-        f"near {scene.near:g} and far {scene.far:g}"
+    return any(
+        _sees_points(grid, pose, values, extent, size) or _meets_box(pose, values, extent, size)
+        for pose, values in zip(poses, intrinsics, strict=True)
     )
 
 
 def _sees_points(
-    points: NDArray[np.float64], pose: NDArray[np.float64], values: NDArray[np.float64], scene: Scene
+    points: NDArray[np.float64],
+    pose: NDArray[np.float64],
+    values: NDArray[np.float64],
+    extent: Extent,
+    size: tuple[int, int],
 ) -> bool:
     """Whether any of the points lies in the image, between near and far: finds small boxes."""
     local = (points - pose[:3, 3]) @ pose[:3, :3]
@@ -146,26 +177,23 @@ def _sees_points(
     column = local[:, 0] / safe * values[0] + values[2]
     row = -local[:, 1] / safe * values[1] + values[3]
     distance = np.linalg.norm(local, axis=-1)
-    seen = (depth > 0) & (distance >= scene.near) & (distance <= scene.far)
-    seen &= (column >= 0) & (column <= scene.train.width) & (row >= 0) & (row <= scene.train.height)
+    seen = (depth > 0) & (distance >= extent.near) & (distance <= extent.far)
+    seen &= (column >= 0) & (column <= size[0]) & (row >= 0) & (row <= size[1])
     return bool(seen.any())
 
 
 def _meets_box(
-    low: NDArray[np.float64],
-    high: NDArray[np.float64],
-    pose: NDArray[np.float64],
-    values: NDArray[np.float64],
-    scene: Scene,
+    pose: NDArray[np.float64], values: NDArray[np.float64], extent: Extent, size: tuple[int, int]
 ) -> bool:
     """Whether a ray of a coarse grid of pixels meets the box between near and far: finds large boxes."""
-    columns, rows = np.meshgrid(np.linspace(0, scene.train.width, 17), np.linspace(0, scene.train.height, 17))
+    low, high = extent.bounds
+    columns, rows = np.meshgrid(np.linspace(0, size[0], 17), np.linspace(0, size[1], 17))
     local = np.stack(
         [(columns - values[2]) / values[0], -(rows - values[3]) / values[1], -np.ones_like(rows)], axis=-1
     ).reshape(-1, 3)
     direction = local / np.linalg.norm(local, axis=-1, keepdims=True) @ pose[:3, :3].T
     inverse = 1 / np.where(np.abs(direction) < 1e-9, 1e-9, direction)
     a, b = (low - pose[:3, 3]) * inverse, (high - pose[:3, 3]) * inverse
-    entry = np.maximum(np.minimum(a, b).max(axis=-1), scene.near)
-    leave = np.minimum(np.maximum(a, b).min(axis=-1), scene.far)
+    entry = np.maximum(np.minimum(a, b).max(axis=-1), extent.near)
+    leave = np.minimum(np.maximum(a, b).min(axis=-1), extent.far)
     return bool((entry < leave).any())

@@ -131,9 +131,16 @@ def _one_line(error: Exception, path: Path) -> str:
     return " ".join(str(error).replace(str(path), "").split()) or type(error).__name__
 
 
+def _open(data: bytes) -> Image.Image:
+    """Open an image without Pillow's own words on broken EXIF data: `upright` refuses them in one line."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return Image.open(io.BytesIO(data))
+
+
 def _decode(data: bytes, path: Path, stated: tuple[int, int] | None, as_stored: bool) -> NDArray[np.float32]:
     """Decode to ``(H, W, 3)`` or ``(H, W, 4)``, whichever the file holds."""
-    with Image.open(io.BytesIO(data)) as opened:
+    with _open(data) as opened:
         image, _ = _turned(opened, path, stated, as_stored)
         if image.mode.startswith("I;16"):
             grey: NDArray[np.float32] = np.divide(np.asarray(image), 65535, dtype=np.float32)
@@ -176,10 +183,10 @@ def copy_upright(
     """
     data = _read_bytes(path)
     try:
-        with Image.open(io.BytesIO(data)) as opened:
+        with _open(data) as opened:
             image, anew = _turned(opened, path, stated, as_stored)
             size = image.size
-            exif = _lens_notes(opened)
+            exif = _lens_notes(opened) if anew else Image.Exif()
             if anew:
                 image.info.clear()
     except _DECODER_ERRORS as error:

@@ -114,7 +114,8 @@ def copy_frames(files: SceneFiles, scene: Path) -> list[Frame]:
     them there.
 
     Raises:
-        InputError: for a picture or mask that is missing or damaged, or outside of its scene.
+        InputError: for a picture or mask that is missing or damaged, outside of its scene, or of another size than its
+            camera or the other pictures.
     """
     frames = sorted([*files.train, *files.test], key=lambda frame: frame.file_path)
     paths = [resolve_inside(files.folder, frame.file_path, frame.where) for frame in frames]
@@ -122,8 +123,16 @@ def copy_frames(files: SceneFiles, scene: Path) -> list[Frame]:
     if len(set(names)) != len(names):
         names = ["_".join(path.relative_to(files.folder.resolve()).parts) for path in paths]
     copied = []
+    first: tuple[int, int] | None = None
     for frame, path, name in zip(frames, paths, names, strict=True):
-        copy_upright(path, scene / "images" / name, stated=frame.camera.size, as_stored=files.as_stored)
+        size = copy_upright(
+            path, scene / "images" / name, stated=frame.camera.size, as_stored=files.as_stored
+        )
+        first = first or size
+        expected = (frame.camera.width or first[0], frame.camera.height or first[1])
+        for wanted in (expected, first):
+            if size != wanted:
+                raise InputError(f"{path}: picture is {size[0]}x{size[1]}, expected {wanted[0]}x{wanted[1]}")
         mask_path = None
         if frame.mask_path is not None:
             mask = resolve_inside(files.folder, frame.mask_path, frame.where)

@@ -16,7 +16,7 @@ from PIL import Image
 
 from gridreg.errors import InputError
 from gridreg.scenes.drawing import draw_cameras
-from gridreg.scenes.extent import Extent, camera_extent, points_extent
+from gridreg.scenes.extent import Extent, box_is_seen, camera_extent, points_extent
 from gridreg.scenes.frames import Camera, Frame
 from gridreg.scenes.load import NotASceneError, read_folder
 from gridreg.scenes.own_pictures import attach_masks, copy_frames, copy_pictures, find_cameras
@@ -166,6 +166,10 @@ def _write(
     scale = _HALF_EDGE / float((extent.bounds[1] - centre).max())
     poses[:, :3, 3] = scale * (poses[:, :3, 3] - centre)
     extent = override(Extent(scale * extent.near, scale * extent.far, scale * (extent.bounds - centre)))
+    if not box_is_seen(extent, poses, intrinsics, size):
+        raise InputError(
+            f"box: no camera sees the box {extent.bounds.tolist()} between near {extent.near:g} and far {extent.far:g}"
+        )
     frames = [replace(frame, pose=pose) for frame, pose in zip(frames, poses, strict=True)]
     content = {EXTENT_KEY: {"near": extent.near, "far": extent.far, "bounds": extent.bounds.tolist()}}
     cameras = [_camera_keys(frame.camera, size) for frame in frames]
