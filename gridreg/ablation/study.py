@@ -246,9 +246,8 @@ def _scene_folder(name: str, file: StudyFile, folder: Path) -> Path | None:
         if place.is_dir():
             return place.resolve()
     hint = "" if data is not None else f"; the folder of scenes is given with data: or in {DATA_VARIABLE}"
-    near = (
-        sorted(path.name for path in data.iterdir() if path.is_dir())[:20] if data and data.is_dir() else []
-    )
+    beside = places[0].parent
+    near = sorted(path.name for path in beside.iterdir() if path.is_dir())[:20] if beside.is_dir() else []
     known = f" there are {', '.join(near)}" if near else ""
     looked = " or ".join(str(place) for place in places)
     raise InputError(
