@@ -45,7 +45,7 @@ def camera_path(
 
     Args:
         name: "turntable", "spiral", "train" (through the training cameras), or a JSON file, see
-        `load_cameras`.
+            `load_cameras`.
         bounds: ``(2, 3)`` box of the field, world units.
         views: the training views, which say where up is, how far away to stand and through which lens to
             look. Without them z is up, the box fits into the picture, and there is no "train".

@@ -163,7 +163,7 @@ def compare_meshes(
         truth: what it should be, in the same coordinates.
         threshold: for the F-score, world units; None: 1 % of the diagonal of the truth's bounding box.
         samples: points drawn from each surface; the figures scatter by about their spread over the root of
-        this.
+            this.
         generator: of the points; None: one seeded with 0.
 
     Raises:

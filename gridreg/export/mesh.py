@@ -178,7 +178,7 @@ def save_mesh(mesh: Mesh, path: str | Path) -> None:
     """Write a mesh as PLY (binary), OBJ or GLB, by the suffix; whole or not at all. Folders are made.
 
     Coordinates are those of the world in every format: a GLB viewer that takes y for up shows a z-up scene
-        lying.
+    lying.
 
     Raises:
         InputError: for another suffix, or if the place is not writable or the disk is full.

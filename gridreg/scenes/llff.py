@@ -1,7 +1,7 @@
 """Reader for forward-facing LLFF scenes, and their normalised device coordinates.
 
 Source: Mildenhall et al. 2019 (LLFF) for the file, NeRF (Mildenhall et al. 2020), appendix C, for the
-    coordinates.
+coordinates.
 """
 
 from __future__ import annotations

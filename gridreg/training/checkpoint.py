@@ -114,7 +114,7 @@ def load_checkpoint(folder: str | os.PathLike[str], *, fingerprint: str | None =
 
     Raises:
         InputError: one line, if there is none, it is damaged, it is of another scene, or a newer gridreg
-        wrote it.
+            wrote it.
     """
     found = _current(*_names(folder))
     if found is None:

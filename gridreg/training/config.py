@@ -30,8 +30,7 @@ def from_yaml(path: str | os.PathLike[str], cls: type[T], *, base: T | None = No
         path: the file; an empty one gives ``base``, or the defaults.
         cls: a dataclass with fields as ``from_data`` knows them.
         base: what holds where the file is silent. Nested dataclasses are merged key by key; lists and dicts
-        are
-            replaced as a whole.
+            are replaced as a whole.
 
     Raises:
         InputError: one line that names file, line and key of what is wrong.

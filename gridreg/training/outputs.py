@@ -240,8 +240,7 @@ def metrics_record(
         scene: name of the scene.
         protocol: name of the protocol.
         builtin: whether the scene is the project's own. Then ``"benchmark"`` is false and the scene's name
-        says so,
-            because its figures must not stand beside published ones.
+            says so, because its figures must not stand beside published ones.
         seed: of the run.
         steps: iterations done.
         seconds: by phase, such as ``train`` and ``test``.

@@ -92,11 +92,10 @@ class Lpips:
 
     Args:
         weights: tensors by the names of the ``lpips`` package: ``net.slice1.0.weight``,
-        ``net.slice1.0.bias``, ...,
-            ``lin0.model.1.weight``, ...
+            ``net.slice1.0.bias``, ..., ``lin0.model.1.weight``, ...
         network: whose features.
         input_range: ``"signed"`` scales images to [-1, 1] first, as LPIPS was calibrated; ``"unit"`` does
-        not.
+            not.
 
     Raises:
         InputError: if a weight is missing or has another shape, or a name is unknown.

@@ -42,8 +42,7 @@ def read_yaml(path: str | os.PathLike[str]) -> Document:
 
     Raises:
         InputError: if the file cannot be read, is not YAML, or uses what is refused here (anchors and
-        aliases,
-            tags, duplicate keys, keys that are not text); the text names file and line.
+            aliases, tags, duplicate keys, keys that are not text); the text names file and line.
     """
     try:
         text = Path(path).read_text(encoding="utf-8")

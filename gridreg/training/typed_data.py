@@ -41,10 +41,11 @@ def from_data(
     Args:
         cls: the dataclass.
         data: a mapping of its keys to plain data; what it leaves out has the default, or the value in
-        ``base``. source: names the data in errors. lines: the line of each key path, if the data come from
-        a file. base: what holds where the data are silent, instead of the defaults. Nested dataclasses are
-        merged key by
-            key; lists and dicts are replaced as a whole.
+            ``base``.
+        source: names the data in errors.
+        lines: the line of each key path, if the data come from a file.
+        base: what holds where the data are silent, instead of the defaults. Nested dataclasses are merged
+            key by key; lists and dicts are replaced as a whole.
 
     Raises:
         InputError: one line that names source, line and key of what is wrong.
