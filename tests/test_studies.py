@@ -36,6 +36,7 @@ ROWS = {
         "FreeNeRF's, weight 0.01, samples=20", "occlusion, distance=0.1", "occlusion, distance=0.3",
     ],
     "printed_mask": ["few_tensorf", "few_tensorf_printed", "few_tensorf_authors", "no masks"],
+    "few_tensorf_pieces": ["neither", "masks alone", "occlusion loss alone", "both"],
     "smoke": ["no masks", "quick", "quick - RandomBackground"],
 }  # fmt: skip
 
