@@ -10,7 +10,7 @@
     baseline: none
     compositions:
       - none                                                   # by name, or `preset` for the preset's own
-      - {name: few_tensorf, remove: [OcclusionLoss]}           # changed
+      - {name: quick, remove: [OcclusionLoss]}                 # changed
       - {label: own, regularizers: [{name: RandomBackground}]} # inline
       - {leave_one_out: quick}                                 # generators
       - {one_at_a_time: quick, on: none}
