@@ -175,7 +175,6 @@ def multiply(rows: int, columns: int) -> None:
 
 def test_network_by_counting() -> None:
     c = COUNTS
-    multiply(3 * c.appearance_channels, c.features)
     encode(*c.encodings[0])
     encode(*c.encodings[2])
     for x in numbers(3):
@@ -184,8 +183,8 @@ def test_network_by_counting() -> None:
     Number.done = 0
     encode(*c.encodings[1])
     by_ray = Number.done
-    assert encoding_operations(*c.encodings[1]) == by_ray
     Number.done = 0
+    multiply(3 * c.appearance_channels, c.features)
     multiply(c.layers[0], c.layers[1])
     multiply(c.layers[1], c.layers[2])
     found = work(c)["colour/network"]
@@ -199,21 +198,24 @@ def test_network_backward_by_counting() -> None:
     c = COUNTS
     wide, hidden, out = c.layers
     wanted = c.encodings[0][0] * (1 + 2 * c.encodings[0][1])
+    components = 3 * c.appearance_channels
     # Gradients of weights are products of a column and a row; of inputs, products with the matrix.
-    for rows, columns, back in ((wide, hidden, wanted), (hidden, out, hidden)):
+    for rows, columns, back in (
+        (wide, hidden, wanted),
+        (hidden, out, hidden),
+        (components, c.features, components),
+    ):
         for _ in range(rows * columns):
             Number() + Number() * Number()
         multiply(columns, back)
-    assert layer_operations_backward(c.layers, wanted) == Number.done
     assert work(c)["backward/network"].low == c.coloured * Number.done
     Number.done = 0
-    for _ in range(3 * c.appearance_channels * c.features):
-        Number() + Number() * Number()
-    multiply(c.features, 3 * c.appearance_channels)
     for _ in range(c.encodings[0][0] * c.encodings[0][1]):
         sine, cosine, of_sine, of_cosine = numbers(4)
         Number() + 2.0 * (cosine * of_sine - sine * of_cosine)
     assert work(c)["backward/network"].operations == c.coloured * Number.done
+    assert layer_operations_backward((2, 3), 0) == 2 * 2 * 3
+    assert encoding_operations(4, 0) == 0
 
 
 def test_march_and_compositing_by_counting() -> None:
@@ -253,7 +255,11 @@ def test_bytes_of_lookups_by_hand() -> None:
     assert density_work(2, 1, 5).cached == 24 + 8 + 2 * 3 * 6 * 4
     found = work(COUNTS)
     c = COUNTS
-    row = 3 * c.appearance_channels * 4
+    # In bfloat16 a component has 2 bytes, else 4.
+    row = 3 * c.appearance_channels * 2
+    single = work(replace(c, low=False))
+    assert single["colour/lookup"].bytes - found["colour/lookup"].bytes == c.coloured * row
+    assert single["backward/network"].bytes - found["backward/network"].bytes == c.coloured * 2 * row
     assert (
         found["colour/lookup"].bytes
         == c.coloured * (12 + row) + c.appearance_nodes * c.appearance_channels * 4
@@ -308,7 +314,7 @@ def test_counts_of_a_step(scene: Path) -> None:
     changes = [*SET, "field.density_shift=-4.0", "train.weight_bound=0.001"]
     arguments = Namespace(scene=scene, protocol=None, preset="few_tensorf", seed=0, set=changes)
     config = common.configuration(arguments)
-    found = situations.early(config, common.scene_of(config, test=()), edge=8, warm_up=2)
+    found = situations.early(config, common.scene_of(config, test=()), edge=8, learning=2)
     counts = roofline.counts_of(found)
     assert (counts.rays, counts.cells) == (32, 7**3)
     assert 0 < counts.coloured <= counts.samples <= counts.steps
@@ -319,13 +325,13 @@ def test_counts_of_a_step(scene: Path) -> None:
     total = sum(p.numel() for p in found.trainer.field.parameters())
     assert 0 < counts.parameters <= total
     bare = replace(config, field={**config.field, "decoder": "sh"}, composition=[])
-    other = situations.early(bare, found.trainer.scene, edge=6, warm_up=1)
+    other = situations.early(bare, found.trainer.scene, edge=6, learning=1)
     with pytest.raises(InputError, match="roofline: found a decoder without layers"):
         roofline.counts_of(other)
 
 
 def test_roofline(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["roofline", "--scene", str(scene), "--early-edge", "8", "--only", "early", "--warm-up", "2"]
+    words = ["roofline", "--scene", str(scene), "--early-edge", "8", "--only", "early", "--begin", "2"]
     words += ["--repeats", "2", "--megabytes", "1", "--matrix", "32", "--threads", "1"]
     words += [
         "--results",
@@ -351,4 +357,4 @@ def test_roofline(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str
 def test_roofline_of_another_backbone_is_refused(scene: Path) -> None:
     words = ["roofline", "--scene", str(scene), "--preset", "cp", "--only", "early", "--early-edge", "6"]
     with pytest.raises(InputError, match="expected VMField"):
-        main.main([*words, "--repeats", "1", "--warm-up", "1", "--megabytes", "1", "--matrix", "8"])
+        main.main([*words, "--repeats", "1", "--begin", "1", "--megabytes", "1", "--matrix", "8"])

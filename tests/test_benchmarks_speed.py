@@ -89,8 +89,8 @@ def checkout(tmp_path: Path) -> Path:
 
 
 def tiny_step(scene: Path) -> list[str]:
-    edges = ["--early-edge", "8", "--late-edge", "12", "--learn", "12", "--warm-up", "2", "--repeats", "2"]
-    return ["--scene", str(scene), *edges, *TINY]
+    edges = ["--early-edge", "8", "--late-edge", "12", "--learn", "12", "--begin", "2", "--warm-up", "2"]
+    return ["--scene", str(scene), *edges, "--repeats", "2", *TINY]
 
 
 def test_step_beside_a_peer(
@@ -164,7 +164,7 @@ def test_bad_peers(checkout: Path, scene: Path, how: str, said: str) -> None:
 def trainer(scene: Path) -> Any:
     arguments = Namespace(scene=scene, protocol=None, preset="tensorf", seed=0, set=TINY[1:])
     config = common.configuration(arguments)
-    return situations.early(config, common.scene_of(config, test=()), edge=8, warm_up=1)
+    return situations.early(config, common.scene_of(config, test=()), edge=8, learning=1)
 
 
 def test_a_peer_that_fails_says_so_in_one_line(checkout: Path, trainer: Any) -> None:

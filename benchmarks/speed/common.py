@@ -123,7 +123,7 @@ def plain_arguments(arguments: argparse.Namespace) -> Record:
     for name, value in vars(arguments).items():
         if name in ("command", "results", "measure", "show", "name"):
             continue
-        kept[name] = value.name if isinstance(value, Path) else value
+        kept[name] = value.resolve().name if isinstance(value, Path) else value
     return kept
 
 

@@ -14,7 +14,7 @@ from gridreg.errors import InputError
 from gridreg.rendering import OccupancyGrid, Rays
 from gridreg.rendering.backends import use_backend
 from gridreg.scenes import Scene
-from gridreg.training import RunConfig, Trainer, build_trainer, events, load_preset
+from gridreg.training import RunConfig, Trainer, build_trainer, events, load_preset, regularizers_of
 
 
 @dataclass(frozen=True)
@@ -77,81 +77,88 @@ def _without_events(config: RunConfig) -> RunConfig:
     return replace(config, train=replace(config.train, occupancy_every=0, **nothing))
 
 
-def _still(trainer: Trainer, name: str) -> Situation:
+def _still(trainer: Trainer, name: str, step: int) -> Situation:
     for group in trainer.optimizer.param_groups:
         group["initial_lr"] = 0.0
-    return Situation(name, trainer, trainer.step)
+    return Situation(name, trainer, step)
 
 
-def early(config: RunConfig, scene: Scene, *, edge: int, warm_up: int) -> Situation:
-    """The start of the schedule: a fresh field of ``edge^3`` cells in the scene's own box, every cell occupied.
+def _middle(first: int, last: int) -> int:
+    return (first + last) // 2
+
+
+def early(config: RunConfig, scene: Scene, *, edge: int, learning: int) -> Situation:
+    """The first part of the schedule: a fresh field of ``edge^3`` cells in the scene's own box, every cell occupied.
+
+    Schedules stand where they are in the middle of that part.
 
     Args:
         config: a preset's.
         scene: with its training views.
         edge: of the grid.
-        warm_up: iterations of training before the field is held still.
+        learning: iterations of training before the field is held still.
     """
-    train = replace(_without_events(config).train, voxels_start=edge**3, carve=False)
-    trainer = build_trainer(replace(config, train=train), scene)
-    trainer.train(until=min(warm_up, config.train.steps))
-    return _still(trainer, f"{edge}³ without occupancy")
+    train = config.train
+    settings = replace(_without_events(config).train, voxels_start=edge**3, carve=False)
+    trainer = build_trainer(replace(config, train=settings), scene)
+    trainer.train(until=min(learning, train.steps))
+    first = min([step for step in (*train.occupancy_at, *train.resample_at) if step], default=train.steps)
+    return _still(trainer, f"{edge}³ without occupancy", _middle(0, first))
 
 
 def learn(config: RunConfig, scene: Scene, steps: int, voxels: int) -> Trainer:
-    """A field that has learnt the scene on the schedule of ``quick`` in ``steps`` iterations.
+    """A preset's field that has learnt the scene as `quick` does, in ``steps`` iterations.
 
     The published initial density takes thousands of iterations to come alive; from a wanted initial opacity, inside the
     visual hull, hundreds do.
 
     Args:
-        config: whose field and composition are taken.
+        config: whose field is taken.
         scene: with its training views.
         steps: iterations.
         voxels: cells that the grid has at most.
     """
-    quick = load_preset("quick").train.scaled(steps)
+    quick = load_preset("quick")
+    schedule = quick.train.scaled(steps)
     train = replace(
-        quick,
+        schedule,
         rays=config.train.rays,
-        voxels_start=min(voxels, quick.voxels_start),
-        voxels_end=min(voxels, quick.voxels_end),
+        voxels_start=min(voxels, schedule.voxels_start),
+        voxels_end=min(voxels, schedule.voxels_end),
     )
     field = config.field
     if config.backbone != "mlp":
         field = {**config.field, "density_shift": None, "initial_opacity": 0.1}
-    trainer = build_trainer(replace(config, field=field, train=train), scene)
+    teaching = replace(config, field=field, train=train, composition=quick.composition)
+    trainer = build_trainer(teaching, scene)
     trainer.train()
+    trainer.handle.remove()
     return trainer
 
 
-def late(
-    config: RunConfig,
-    scene: Scene,
-    *,
-    edge: int,
-    learning: int,
-    warm_up: int,
-) -> Situation:
+def late(config: RunConfig, scene: Scene, *, edge: int, learning: int, warm_up: int) -> Situation:
     """The last part of the schedule: a field that has learnt the scene, of ``edge^3`` cells, with its occupancy.
 
+    Schedules stand where they are in the middle of that part.
+
     Args:
-        config: a preset's; its settings hold from the last resampling on.
+        config: a preset's; its composition and settings hold from the last resampling on.
         scene: with its training views.
         edge: of the grid.
         learning: iterations in which the field learns the scene.
         warm_up: iterations at the last size, before the field is held still.
     """
-    trainer = learn(config, scene, learning, edge**3)
-    settings = _without_events(config).train
-    steps = max(settings.steps, trainer.step + warm_up + 1)
-    trainer.settings = replace(settings, voxels_start=edge**3, carve=True, steps=steps)
+    taught = learn(config, scene, learning, edge**3)
+    settings = replace(_without_events(config).train, voxels_start=edge**3, carve=True)
+    trainer = Trainer(taught.field, scene, regularizers_of(config), settings, seed=config.seed)
+    last = max(config.train.resample_at, default=0)
+    trainer.step = middle = _middle(last, settings.steps)
     if hasattr(trainer.field, "resample"):
         events.resample(trainer)
     events.update_occupancy(trainer)
     events.filter_rays(trainer)
-    trainer.train(until=trainer.step + warm_up)
-    return _still(trainer, f"{edge}³ with occupancy")
+    trainer.train(until=min(middle + warm_up, settings.steps))
+    return _still(trainer, f"{edge}³ with occupancy", middle)
 
 
 def require_grid(trainer: Trainer, option: str) -> None:

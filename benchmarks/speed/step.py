@@ -31,10 +31,16 @@ def add_situation_arguments(parser: argparse.ArgumentParser) -> None:
         "--late-edge", type=common.at_least(2), default=300, help="edge of the grid with occupancy"
     )
     group.add_argument(
-        "--learn", type=common.count, default=300, help="iterations that teach the field the scene"
+        "--begin",
+        type=common.count,
+        default=200,
+        help="iterations of the schedule before the first is held still",
     )
     group.add_argument(
-        "--warm-up", type=common.count, default=30, help="iterations before a field is held still"
+        "--learn", type=common.count, default=400, help="iterations that teach the second field the scene"
+    )
+    group.add_argument(
+        "--warm-up", type=common.count, default=30, help="iterations at its last size before it is held still"
     )
     group.add_argument("--only", choices=("early", "late"), help="one situation instead of both")
 
@@ -50,9 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def make(arguments: argparse.Namespace, config: RunConfig, scene: Scene) -> list[Callable[[], Situation]]:
     """The situations, each built when it is called, so that one is in memory at a time."""
     wanted: dict[str, Callable[[], Situation]] = {
-        "early": lambda: situations.early(
-            config, scene, edge=arguments.early_edge, warm_up=arguments.warm_up
-        ),
+        "early": lambda: situations.early(config, scene, edge=arguments.early_edge, learning=arguments.begin),
         "late": lambda: situations.late(
             config, scene, edge=arguments.late_edge, learning=arguments.learn, warm_up=arguments.warm_up
         ),

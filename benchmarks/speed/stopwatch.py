@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import torch
 
 import gridreg.training.trainer as trainer_module
+from backbones import kernels
 from backbones.kernels import autograd, cp, encoded, linear, vm_gradient
 from gridreg.rendering import backends, plain, render
 from gridreg.training import Trainer
@@ -112,6 +113,8 @@ def places_of(trainer: Trainer) -> list[Place]:
         Place(autograd, "_march", "march"),
         Place(field, _first(field, "march_density", "density"), "density"),
         Place(field, _first(field, "colour_of_rays", "colour"), "colour/network"),
+        Place(kernels, "vm_features", "colour/lookup"),
+        Place(kernels, "cp_features", "colour/lookup"),
         # All of the rendering that is neither of the above: weights, sums along rays, packing.
         Place(trainer_module, "render_rays", "compositing"),
         Place(torch.Tensor, "backward", "backward/other"),
@@ -123,8 +126,6 @@ def places_of(trainer: Trainer) -> list[Place]:
         Place(linear, "chain_backward", "backward/network"),
         Place(trainer.optimizer, "step", "optimiser"),
     ]
-    if hasattr(field, "appearance_features"):
-        found.append(Place(field, "appearance_features", "colour/lookup"))
     hooks = ("step", "update_groups", "background", "near_far", "on_samples", "loss", "grid_terms")
     return found + [Place(handle, name, "penalties") for name in hooks]
 

@@ -13,14 +13,17 @@ for each of three directions, C channels each (D for density, A for appearance),
     rays              48 R                                     24 R
     march             36 R + 8 (R + 1) + min(S, cells) + 24 N  9 N
     density           16 N + 4 D P                             N (36 D + 31)
-    colour/lookup     12 M + 12 A M + 4 A P                    M (33 A + 27)
-    colour/network    12 A M + 32 M + 4 weights                M (6 A F + layers + encodings + 9)
+    colour/lookup     12 M + 3 e A M + 4 A P                   M (33 A + 27)
+    colour/network    3 e A M + 32 M + 4 weights               M (6 A F + layers + encodings + 9)
     compositing       12 N + 12 M + 32 R                       8 N + 6 M + 7 R
     backward/other    12 N + 24 M                              5 N + 17 M
-    backward/network  24 A M + 12 M + 8 weights                2 (6 A F M) + layers and encodings backwards
-    backward/lookup   12 M + 12 A M + 12 A P                   M (72 A + 27)
+    backward/network  6 e A M + 12 M + 8 weights               2 (6 A F M) + layers and encodings backwards
+    backward/lookup   12 M + 3 e A M + 12 A P                  M (72 A + 27)
     backward/density  20 N + 12 D P                            N (72 D + 31)
     optimiser         32 a parameter                           13 a parameter
+
+e is the size of a product of plane and line that is handed to the basis: 2 bytes where the basis and the layers
+multiply in bfloat16, else 4.
 
 * march: ``t = t_min + (index + jitter) step`` and ``o + t d``; origin, direction, entry, exit and jitter are read; an
   index, a distance and a position are written.
@@ -73,7 +76,7 @@ class Counts:
         layers: widths of the decoder, its input first.
         encodings: inputs of the decoder as (dimensions, octaves): features, direction, position if it reads it.
         parameters: that Adam updates.
-        low: whether the decoder multiplies in bfloat16.
+        low: whether basis and decoder multiply in bfloat16, and products of planes and lines are handed over in it.
     """
 
     rays: int
@@ -90,6 +93,11 @@ class Counts:
     encodings: tuple[tuple[int, int], ...]
     parameters: int
     low: bool
+
+    @property
+    def component_bytes(self) -> int:
+        """Of a product of plane and line that is handed to the basis."""
+        return 2 if self.low else 4
 
 
 @dataclass(frozen=True)
@@ -139,9 +147,9 @@ def density_work(n: int, channels: int, nodes: int) -> Work:
     return Work(once, n * (36 * channels + 31), cached=16 * n + 72 * channels * n)
 
 
-def lookup_work(m: int, channels: int, nodes: int) -> Work:
-    """Products of planes and lines, side by side: ``M`` samples."""
-    kept = 12 * m + 12 * channels * m
+def lookup_work(m: int, channels: int, nodes: int, size: int) -> Work:
+    """Products of planes and lines of ``size`` bytes, side by side: ``M`` samples."""
+    kept = 12 * m + 3 * size * channels * m
     return Work(kept + 4 * channels * nodes, m * (33 * channels + 27), cached=kept + 72 * channels * m)
 
 
@@ -151,9 +159,9 @@ def density_backward_work(n: int, channels: int, nodes: int) -> Work:
     return Work(kept + 12 * channels * nodes, n * (72 * channels + 31), cached=kept + 216 * channels * n)
 
 
-def lookup_backward_work(m: int, channels: int, nodes: int) -> Work:
-    """Gradients of planes and lines from those of their products."""
-    kept = 12 * m + 12 * channels * m
+def lookup_backward_work(m: int, channels: int, nodes: int, size: int) -> Work:
+    """Gradients of planes and lines from those of their products, of ``size`` bytes."""
+    kept = 12 * m + 3 * size * channels * m
     return Work(kept + 12 * channels * nodes, m * (72 * channels + 27), cached=kept + 216 * channels * m)
 
 
@@ -165,13 +173,14 @@ def network_work(c: Counts) -> tuple[Work, Work]:
     (dims, octaves), (of_direction, turns), *position = c.encodings
     encoded = encoding_operations(dims, octaves) + sum(encoding_operations(d, o) for d, o in position)
     wanted = dims * (1 + 2 * octaves)
-    forward = m * (basis + encoded + 9) + c.rays * encoding_operations(of_direction, turns)
-    # Of each octave a sine and a cosine: two products, a difference, a factor and a sum.
-    back = m * (2 * basis + 5 * dims * octaves)
-    products, products_back = m * layer_operations(widths), m * layer_operations_backward(widths, wanted)
+    # Sigmoids; backwards, of each octave a sine and a cosine: two products, a difference, a factor and a sum.
+    forward = m * (encoded + 9) + c.rays * encoding_operations(of_direction, turns)
+    back = m * 5 * dims * octaves
+    products = m * (basis + layer_operations(widths))
+    products_back = m * (2 * basis + layer_operations_backward(widths, wanted))
     low, low_back = (products, products_back) if c.low else (0, 0)
-    moved = 4 * components * m + 32 * m + 4 * weights
-    moved_back = 8 * components * m + 12 * m + 8 * weights
+    handed = c.component_bytes * components * m
+    moved, moved_back = handed + 32 * m + 4 * weights, 2 * handed + 12 * m + 8 * weights
     return (
         Work(moved, forward + products - low, low, moved),
         Work(moved_back, back + products_back - low_back, low_back, moved_back),
@@ -190,12 +199,14 @@ def work(c: Counts) -> dict[str, Work]:
         "rays": streamed(48 * r, 24 * r),
         "march": streamed(36 * r + 8 * (r + 1) + min(c.steps, c.cells) + 24 * n, 9 * n),
         "density": density_work(n, c.density_channels, c.density_nodes),
-        "colour/lookup": lookup_work(m, c.appearance_channels, c.appearance_nodes),
+        "colour/lookup": lookup_work(m, c.appearance_channels, c.appearance_nodes, c.component_bytes),
         "colour/network": forward,
         "compositing": streamed(12 * n + 12 * m + 32 * r, 8 * n + 6 * m + 7 * r),
         "backward/other": streamed(12 * n + 24 * m, 5 * n + 17 * m),
         "backward/network": backward,
-        "backward/lookup": lookup_backward_work(m, c.appearance_channels, c.appearance_nodes),
+        "backward/lookup": lookup_backward_work(
+            m, c.appearance_channels, c.appearance_nodes, c.component_bytes
+        ),
         "backward/density": density_backward_work(n, c.density_channels, c.density_nodes),
         "optimiser": streamed(32 * c.parameters, 13 * c.parameters),
     }
