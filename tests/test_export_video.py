@@ -17,10 +17,11 @@ from gridreg.errors import InputError
 from gridreg.export.camera_paths import camera_path
 from gridreg.export.cameras import Camera, Lens
 from gridreg.export.model import Model
-from gridreg.export.pictures import beside, colour_bar, depth_range, picture
+from gridreg.export.pictures import colour_bar, depth_range, picture
 from gridreg.export.video import render_frames, render_video
 from gridreg.export.writers import write_video
 from gridreg.rendering import Rays, Rendered
+from gridreg.training.pictures import row
 from tests.export_fields import AnalyticField, ball, ring_of_views
 
 RED = torch.tensor([1.0, 0.0, 0.0])
@@ -126,14 +127,14 @@ class TestPictures:
     def test_bar_has_far_above_and_figures(self):
         bar = colour_bar(120, (1.0, 3.0))
         assert bar.shape == (120, 64, 3)
-        assert bar[10, 8, 0] > bar[10, 8, 2]
-        assert bar[109, 8, 2] > bar[109, 8, 0]
+        assert bar[15, 8, 0] > bar[15, 8, 2]
+        assert bar[104, 8, 2] > bar[104, 8, 0]
         assert (bar[:, 20:] < 128).any()
         assert not np.array_equal(bar, colour_bar(120, (1.0, 4.0)))
         assert colour_bar(3, (0.0, 1.0)).shape == (3, 64, 3)
 
     def test_beside_fills_up_with_white(self):
-        joined = beside([np.zeros((2, 3, 3), np.uint8), np.full((4, 1, 3), 9, np.uint8)])
+        joined = row([np.zeros((2, 3, 3), np.uint8), np.full((4, 1, 3), 9, np.uint8)], gap=0)
         assert joined.shape == (4, 4, 3)
         assert (joined[2:, :3] == 255).all()
         assert (joined[:, 3] == 9).all()

@@ -11,9 +11,10 @@ import numpy as np
 from gridreg.errors import InputError
 from gridreg.export.cameras import Camera
 from gridreg.export.model import Model
-from gridreg.export.pictures import DepthRange, Pixels, beside, check_mode, colour_bar, depth_range, picture
+from gridreg.export.pictures import DepthRange, check_mode, colour_bar, depth_range, picture
 from gridreg.export.writers import check_target, write_video
 from gridreg.rendering import Rendered
+from gridreg.training.pictures import Picture, row
 
 __all__ = ["Progress", "render_frames", "render_video"]
 
@@ -58,7 +59,7 @@ def render_frames(
     *,
     modes: Sequence[str] = ("rgb",),
     depths: DepthRange | None = None,
-) -> Iterator[Pixels]:
+) -> Iterator[Picture]:
     """The frames of `render_video`, ``(H, W, 3)`` uint8, one after the other.
 
     Raises:
@@ -81,12 +82,12 @@ def render_frames(
 
 def _frames(
     models: Sequence[Model], cameras: Sequence[Camera], modes: Sequence[str], depths: DepthRange | None
-) -> Iterator[Pixels]:
+) -> Iterator[Picture]:
     for camera in cameras:
         parts = [picture(render, mode, depths) for render in _renders(models, camera) for mode in modes]
         if "depth" in modes and depths is not None:
             parts.append(colour_bar(camera.lens.height, depths))
-        yield beside(parts)
+        yield row(parts, gap=0)
 
 
 def _renders(models: Sequence[Model], camera: Camera) -> list[Rendered]:
@@ -101,7 +102,7 @@ def _film_depths(models: Sequence[Model], cameras: Sequence[Camera], looks: int 
     return depth_range([render for camera in small for render in _renders(models, camera)])
 
 
-def _reported(frames: Iterable[Pixels], total: int, progress: Progress | None) -> Iterator[Pixels]:
+def _reported(frames: Iterable[Picture], total: int, progress: Progress | None) -> Iterator[Picture]:
     start = time.monotonic()
     for done, frame in enumerate(frames, start=1):
         if progress is not None:

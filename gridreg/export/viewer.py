@@ -17,11 +17,12 @@ from gridreg.export.browser import add_frustums, camera_of, picture_shape, quiet
 from gridreg.export.cameras import Camera, orbit_of_box, orbit_of_views
 from gridreg.export.model import Model
 from gridreg.export.pace import Pace
-from gridreg.export.pictures import Pixels, colour_bar, depth_range, picture, z_depth
+from gridreg.export.pictures import colour_bar, depth_range, picture, z_depth
 from gridreg.export.preview import Preview
 from gridreg.export.viewer_panel import Look, Panel
 from gridreg.rendering import Rendered
 from gridreg.scenes import Views
+from gridreg.training.pictures import Picture
 
 __all__ = ["Viewer"]
 
@@ -275,7 +276,7 @@ class _Screen:
         self.moved = 0.0
 
 
-def _composed(rendered: Rendered, look: Look) -> tuple[Pixels, str]:
+def _composed(rendered: Rendered, look: Look) -> tuple[Picture, str]:
     """The picture for the page, and what to say about it."""
     if look.mode != "depth":
         return picture(rendered, look.mode), ""

@@ -9,6 +9,10 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Any
+
+# Share of the pictures above which a second attempt is not worth its time.
+_ENOUGH = 0.9
 
 STAGES = ("features", "matches", "cameras")
 """Lines that the program prints while it works, before ``registered N``."""
@@ -28,17 +32,35 @@ def reconstruct(pictures: Path, out: Path) -> int:
     print(STAGES[1], flush=True)
     pycolmap.match_exhaustive(database)
     print(STAGES[2], flush=True)
-    (out / "models").mkdir()
+    # A lens that is adjusted from the first pair on can collapse to a wide angle when cameras stand in a circle. So it
+    # stays as EXIF data say (or as most lenses are) until all pictures have their places.
+    best = _largest_model(database, pictures, out / "kept_lens", adjust_lens=False)
+    if best is not None:
+        pycolmap.bundle_adjustment(best, pycolmap.BundleAdjustmentOptions())
+    count = sum(1 for path in pictures.iterdir() if path.is_file())
+    if best is None or best.num_reg_images() < _ENOUGH * count:
+        free = _largest_model(database, pictures, out / "free_lens", adjust_lens=True)
+        if free is not None and (best is None or free.num_reg_images() > best.num_reg_images()):
+            best = free
+    if best is None:
+        return 0
+    (out / "model").mkdir()
+    best.write_binary(str(out / "model"))
+    return int(best.num_reg_images())
+
+
+def _largest_model(database: Path, pictures: Path, out: Path, *, adjust_lens: bool) -> Any:
+    """The ``pycolmap.Reconstruction`` with the most pictures, or None."""
+    import pycolmap
+
+    out.mkdir()
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = 0
     options.mapper.random_seed = 0
-    models = pycolmap.incremental_mapping(database, pictures, out / "models", options)
-    if not models:
-        return 0
-    largest = max(models.values(), key=lambda model: model.num_reg_images())
-    (out / "model").mkdir()
-    largest.write_binary(str(out / "model"))
-    return int(largest.num_reg_images())
+    options.ba_refine_focal_length = adjust_lens
+    options.ba_refine_extra_params = adjust_lens
+    models = pycolmap.incremental_mapping(database, pictures, out, options)
+    return max(models.values(), key=lambda model: model.num_reg_images(), default=None)
 
 
 if __name__ == "__main__":

@@ -18,6 +18,8 @@ from gridreg.training.metrics import json_ready, mean_metrics
 from gridreg.training.pictures import (
     Picture,
     coloured,
+    depth_limits,
+    fading_into_white,
     labelled,
     row,
     save_png,
@@ -116,15 +118,12 @@ def depth_picture(depth: Tensor, opacity: Tensor) -> Picture:
         raise InputError(
             f"depth, opacity: {tuple(depth.shape)}, {tuple(opacity.shape)}; expected (H, W) both"
         )
-    share = opacity.detach().double().nan_to_num(0).clamp(0, 1).cpu().numpy()
-    distance = depth.detach().double().nan_to_num(0).cpu().numpy() / np.maximum(share, 1e-6)
-    seen = distance[share > 0.5]
-    near, far = (float(v) for v in np.quantile(seen, [0.01, 0.99])) if seen.size else (0.0, 1.0)
-    far = max(far, near + 1e-3)
-    picture = coloured(distance, near, far, "viridis_r")
-    blended = picture * share[..., None] + 255 * (1 - share[..., None])
+    share = opacity.detach().double().nan_to_num(0).clamp(0, 1).cpu()
+    distance = depth.detach().double().nan_to_num(0).cpu() / share.clamp(min=1e-6)
+    near, far = depth_limits(distance[share > 0.5])
+    picture = fading_into_white(coloured(distance.numpy(), near, far, "viridis_r"), share)
     zoom = max(1, math.ceil(200 / max(share.shape)))
-    body = thumbnail(np.round(blended).astype(np.uint8), zoom * max(share.shape))
+    body = thumbnail(picture, zoom * max(share.shape))
     return row([body, scale_bar(body.shape[0], near, far, "viridis_r", "depth")])
 
 

@@ -19,7 +19,18 @@ from torch import Tensor
 from gridreg.errors import InputError
 from gridreg.training.files import write_bytes
 
-__all__ = ["Picture", "coloured", "labelled", "row", "save_png", "scale_bar", "thumbnail", "to_picture"]
+__all__ = [
+    "Picture",
+    "coloured",
+    "depth_limits",
+    "fading_into_white",
+    "labelled",
+    "row",
+    "save_png",
+    "scale_bar",
+    "thumbnail",
+    "to_picture",
+]
 
 Picture = NDArray[np.uint8]
 
@@ -84,6 +95,24 @@ def scale_bar(height: int, low: float, high: float, colours: str = "inferno", un
     if top > margin:
         draw.text((4, 3), unit, fill="black", font=_font())
     return np.asarray(image)
+
+
+def depth_limits(seen: Tensor) -> tuple[float, float]:
+    """Ends of a scale for depths ``(N,)``: their 1st and 99th percentile and a little more; (0, 1) for none."""
+    values = seen.detach().double().cpu().numpy()
+    if not values.size:
+        return 0.0, 1.0
+    near, far = (float(v) for v in np.quantile(values, [0.01, 0.99]))
+    # One flat wall would leave no range to spread colours over.
+    margin = max(0.05 * (far - near), 1e-3 * abs(far), 1e-6)
+    return near - margin, far + margin
+
+
+def fading_into_white(picture: Picture, opacity: Tensor) -> Picture:
+    """The picture ``(H, W, 3)`` blended with white where the opacity ``(H, W)`` is below 1; NaN counts as 0."""
+    share = opacity.detach().double().nan_to_num(0).clamp(0, 1).cpu().numpy()[..., None]
+    blended: Picture = np.round(picture * share + 255 * (1 - share)).astype(np.uint8)
+    return blended
 
 
 def labelled(picture: Picture, text: str) -> Picture:

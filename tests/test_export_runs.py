@@ -1,0 +1,154 @@
+"""Runs as models, films, meshes, and watched while they are under way."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from gridreg.errors import InputError
+from gridreg.export import LiveView, draw_run, film_path, live_view, model_of_run, model_of_trainer
+from gridreg.export.cameras import Camera, Lens
+from gridreg.scenes import Scene, builtin_scene, load_scene
+from gridreg.training import Execution, RunConfig, TrainSettings, build_trainer, execute, load_run
+from gridreg.training.curves import History
+from gridreg.training.rays import warp_of
+from tests.export_viewing import FakeClient
+from tests.forward_scene import write_forward_scene
+
+FIELD = {"density_components": 3, "appearance_components": 3, "density_shift": None, "width": 8}
+SETTINGS = TrainSettings(
+    steps=6,
+    rays=64,
+    voxels_start=1000,
+    voxels_end=1500,
+    resample_at=(3,),
+    occupancy_at=(),
+    shrink_at=(),
+    filter_rays_at=(),
+)
+CONFIG = RunConfig(
+    field=FIELD,
+    train=SETTINGS,
+    composition=[{"name": "FixedMask", "site": "density", "visible_ratio": 0.4}],
+)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return load_scene(builtin_scene(tmp_path_factory.mktemp("scene"), size=16), "builtin8", test=(0,))
+
+
+@pytest.fixture(scope="module")
+def forward(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return load_scene(write_forward_scene(tmp_path_factory.mktemp("forward") / "f", size=16), "holdout8")
+
+
+def started(scene: Scene, out: Path) -> Execution:
+    return Execution(CONFIG, scene, out, build_trainer(CONFIG, scene), History(1), {})
+
+
+def test_a_loaded_run_looks_like_the_trained_one(scene: Scene, tmp_path: Path) -> None:
+    run, _ = execute(CONFIG, scene, tmp_path / "run")
+    run.trainer.field.eval()
+    camera = Camera(scene.train.poses[0], Lens.of_views(scene.train))
+    trained = model_of_trainer(run.trainer)
+    loaded = model_of_run(load_run(tmp_path / "run"))
+    assert loaded.handle is not None
+    assert loaded.handle.current_step == 6
+    # The mask is never fully open, so a dropped handle would be seen.
+    assert min(float(mask.min()) for mask in loaded.handle.masks().values()) < 1
+    one, two = trained.render(camera), loaded.render(camera)
+    assert one is not None
+    assert two is not None
+    torch.testing.assert_close(two.colour, one.colour)
+    loaded.handle.remove()
+    bare = loaded.render(camera)
+    assert bare is not None
+    assert not torch.equal(bare.colour, two.colour)
+
+
+def test_film_paths(scene: Scene, forward: Scene) -> None:
+    model = model_of_trainer(build_trainer(CONFIG, scene))
+    assert len(film_path(model, None, frames=3)) == 3
+    turn = film_path(model, scene.train, frames=4, width=8)
+    assert {camera.lens.width for camera in turn} == {8}
+    # Once around: opposite cameras look in opposite directions across the vertical axis.
+    assert float(turn[0].pose[:2, 2] @ turn[2].pose[:2, 2]) < 0
+
+    facing = model_of_trainer(build_trainer(CONFIG, forward))
+    assert facing.warp == warp_of(forward)
+    sway = film_path(facing, forward.train, frames=5)
+    assert all(float(camera.pose[2, 2]) > 0.9 for camera in sway)
+    assert len(film_path(facing, forward.train, "train", frames=2)) == 2
+    with pytest.raises(InputError, match="a forward-facing scene has no back"):
+        film_path(facing, forward.train, "turntable")
+    with pytest.raises(InputError, match="needs the training cameras"):
+        film_path(facing)
+
+
+def test_what_is_drawn_of_a_run(
+    scene: Scene, forward: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = started(scene, tmp_path)
+    run.trainer.occupancy.cells.zero_()
+    assert draw_run(run, video=False) == []
+    assert capsys.readouterr().err.startswith("no mesh: ")
+    assert draw_run(run, mesh=False, video=False) == []
+    facing = started(forward, tmp_path)
+    assert draw_run(facing) == [tmp_path / "spiral.mp4"]
+    assert "not in world coordinates" in capsys.readouterr().err
+    assert {path.name for path in tmp_path.iterdir()} == {"spiral.mp4"}
+
+
+def test_nobody_asked_for_a_view() -> None:
+    with live_view(False) as look:
+        assert look is None
+
+
+def test_a_run_that_is_watched(scene: Scene, tmp_path: Path) -> None:
+    pytest.importorskip("viser")
+    with live_view(True, port=0) as look:
+        assert look is not None
+        assert look.viewer is None
+        seen = []
+
+        class Watched:
+            """Somebody opens the page before the first iteration."""
+
+            def start(self, run: Execution) -> None:
+                look.start(run)
+                assert look.viewer is not None
+                assert not (tmp_path / "run/config.yaml").exists()
+                look.viewer._refresh = 0.0
+                look.viewer._connected(FakeClient(run.scene.train.poses[0]))
+
+            def step(self, report: dict[str, float]) -> None:
+                look.step(report)  # type: ignore[arg-type]
+                assert look.viewer is not None
+                seen.append(look.viewer._preview.step)
+
+        plain, _ = execute(CONFIG, scene, tmp_path / "plain")
+        run, metrics = execute(CONFIG, scene, tmp_path / "run", watch=Watched())
+        assert metrics is not None
+        assert seen == [0, 1, 2, 3, 4, 5]
+        for name, value in plain.trainer.field.state_dict().items():
+            assert torch.equal(run.trainer.field.state_dict()[name], value), name
+        assert look.viewer is not None
+        assert look.viewer.watched
+        look.viewer._screens.clear()
+        # Nobody looks any more, so there is nothing to wait for.
+        look.finish()
+        viewer = look.viewer
+    assert viewer._closed
+
+
+def test_a_view_that_was_never_started_closes() -> None:
+    pytest.importorskip("viser")
+    look = LiveView(port=0)
+    look.finish()
+    look.close()
+    assert look.viewer is None
+    assert replace(CONFIG, seed=1) != CONFIG
