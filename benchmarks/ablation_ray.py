@@ -63,7 +63,7 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, default=4, help="runs are twice as many")
     parser.add_argument("--repeat", type=int, default=2)
     arguments = parser.parse_args()
-    import_ray("given")
+    import_ray()
     from ray.cluster_utils import Cluster
 
     study = study_from_text(

@@ -199,7 +199,7 @@ def test_what_a_worker_does(tmp_path):
 def cluster():
     """A head without processors, and two nodes of one each: three raylets on this machine."""
     pytest.importorskip("ray", reason="Ray is not installed (extra: ray)")
-    ray_cluster.import_ray("given")
+    ray_cluster.import_ray()
     with warnings.catch_warnings():
         # Ray's own start and end, which leave sockets and logs to the garbage collector.
         warnings.simplefilter("ignore")

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from dataclasses import dataclass, replace
+from typing import Any
 
 from gridreg.ablation.records import Study
 from gridreg.ablation.runners import Event, Report
@@ -21,6 +22,9 @@ __all__ = ["LOG_NAME", "Processes", "usable_cores"]
 LOG_NAME = "workers.log"
 """File in the store with what worker processes print outside of runs."""
 
+# Ctrl-C in the terminal is for this process, which tells the others. A group of their own keeps them in the session,
+# whose share of the processor Linux divides; Python 3.10 knows sessions only.
+_APART: dict[str, Any] = {"process_group": 0} if sys.version_info >= (3, 11) else {"start_new_session": True}
 _POLL = 0.2
 _MOST_IDLE_DEATHS = 3
 
@@ -103,8 +107,7 @@ class Processes:
                 stdout=log,
                 stderr=log,
                 env={**os.environ, **threads, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-                # Ctrl-C in the terminal is for this process, which tells the others.
-                start_new_session=True,
+                **_APART,
             )
         return _Child(process, Worker.of(process.pid))
 

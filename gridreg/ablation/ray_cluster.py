@@ -14,7 +14,7 @@ from gridreg.errors import InputError
 
 __all__ = ["ANSWER_SECONDS", "check_answers", "connected", "import_ray"]
 
-ANSWER_SECONDS = 10.0
+ANSWER_SECONDS = 5.0
 """How long an address may take to answer."""
 
 # HTTP/2 (RFC 9113): the types of frames that matter here, and the flags that end headers and a stream.
@@ -38,7 +38,7 @@ def import_ray(address: str | None = None) -> Any:
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     if address is not None:
         # Ray asks once a second, by default for twenty.
-        os.environ.setdefault("RAY_NUM_REDIS_GET_RETRIES", "6")
+        os.environ.setdefault("RAY_NUM_REDIS_GET_RETRIES", "8")
     try:
         import ray
     except ImportError as error:
