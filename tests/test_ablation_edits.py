@@ -52,7 +52,7 @@ def test_equal_compositions_are_equal_data():
         ("FrequencyMask density", 1),
         ("FrequencyMask encoding.*", 3),
         ({"name": "FrequencyMask", "site": "encoding.*"}, 3),
-        ({"site": "density"}, 4),
+        ({"site": "density"}, 3),
         ("OcclusionLoss", 1),
         ("L1 appearance", 0),
     ],
@@ -86,8 +86,8 @@ def test_remove():
         "OcclusionLoss",
         "Orthogonality density",
         "Orthogonality appearance",
-        "TotalVariation density",
-        "TotalVariation appearance",
+        "TotalVariation density.planes",
+        "TotalVariation appearance.planes",
     ]
     assert len(removed(FEW, "TotalVariation density")) == len(FEW) - 1
 

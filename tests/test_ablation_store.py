@@ -311,7 +311,10 @@ def test_several_writers_some_of_them_killed(store):
         ("done", metrics(float(r.spec.seed))) for r in results
     ]
     attempts = store.attempts()
-    assert sorted(a["hash"] for a in attempts if a["outcome"] == "done") == sorted(r.hash for r in runs)
+    # Of a worker killed between the result and its row, the result counts and the attempt is lost.
+    done = [a["hash"] for a in attempts if a["outcome"] == "done"]
+    assert len(done) == len(set(done))
+    assert set(done) <= {r.hash for r in runs}
     assert {a["outcome"] for a in attempts} <= {"done", "lost"}
     assert len(list(store.folder.glob("runs/*/result.json"))) == 60
 

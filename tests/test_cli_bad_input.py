@@ -7,6 +7,7 @@ import os
 import shutil
 import socket
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,14 @@ from gridreg.training.checkpoint import FORMAT_VERSION
 
 Refused = Callable[..., str]
 SMALL = ("--steps", "5", "--set", "train.rays=64", "train.voxels_start=1000", "train.voxels_end=1000")
+
+# Without viser, `view` has another complaint: see `test_without_viser`.
+VIEW = pytest.param(
+    "view",
+    marks=pytest.mark.skipif(
+        find_spec("viser") is None, reason="viser is not installed: pip install '.[viewer]'"
+    ),
+)
 
 
 @pytest.fixture
@@ -242,7 +251,7 @@ def test_names_and_numbers(refused: Refused, scene: Path) -> None:
 # --- checkpoints
 
 
-@pytest.mark.parametrize("command", ["eval", "mesh", "render", "view"])
+@pytest.mark.parametrize("command", ["eval", "mesh", "render", VIEW])
 def test_no_checkpoint(refused: Refused, tmp_path: Path, command: str) -> None:
     more = ["--port", "0"] if command == "view" else []
     assert "nowhere: no checkpoint here" in refused(command, "nowhere", *more)
@@ -251,7 +260,7 @@ def test_no_checkpoint(refused: Refused, tmp_path: Path, command: str) -> None:
     assert "run: holds no checkpoint, expected the output folder of a run" in line
 
 
-@pytest.mark.parametrize("command", ["eval", "mesh", "render", "view"])
+@pytest.mark.parametrize("command", ["eval", "mesh", "render", VIEW])
 def test_a_checkpoint_from_a_newer_version(
     refused: Refused, tmp_path: Path, empty_run: Path, command: str
 ) -> None:
