@@ -170,16 +170,15 @@ def measure(arguments: argparse.Namespace) -> tuple[Record, str]:
         situation = build()
         watched = step.Watched(situation, "auto")
         # One turn's rays, over and over: those that are counted.
-        times = common.in_turns({"watched": lambda _, run=watched: run(0)}, arguments.repeats)
-        figures = watched.figures(skip=2)
+        common.in_turns({"watched": lambda _, run=watched: run(0)}, arguments.repeats)
+        whole, parts = watched.typical(skip=2)
         counts = counts_of(situation)
-        whole = common.medians(times)["watched"]
         found.append(
             {
                 **situation.describe(1),
                 "counts": asdict(counts),
-                "sum_of_stages": figures["sum_of_stages"],
-                **account(counts, figures["parts"], rates, whole),
+                "sum_of_stages": watched.figures(skip=2)["sum_of_stages"],
+                **account(counts, parts, rates, whole),
             }
         )
     record = {

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -14,7 +15,7 @@ from gridreg.errors import InputError
 from gridreg.rendering import OccupancyGrid, Rays
 from gridreg.rendering.backends import use_backend
 from gridreg.scenes import Scene
-from gridreg.training import RunConfig, Trainer, build_trainer, events, load_preset, regularizers_of
+from gridreg.training import RunConfig, Trainer, build_trainer, events, load_preset, load_run, regularizers_of
 
 
 @dataclass(frozen=True)
@@ -136,7 +137,15 @@ def learn(config: RunConfig, scene: Scene, steps: int, voxels: int) -> Trainer:
     return trainer
 
 
-def late(config: RunConfig, scene: Scene, *, edge: int, learning: int, warm_up: int) -> Situation:
+def late(
+    config: RunConfig,
+    scene: Scene,
+    *,
+    edge: int,
+    learning: int,
+    warm_up: int,
+    trained: Path | None = None,
+) -> Situation:
     """The last part of the schedule: a field that has learnt the scene, of ``edge^3`` cells, with its occupancy.
 
     Schedules stand where they are in the middle of that part.
@@ -147,18 +156,34 @@ def late(config: RunConfig, scene: Scene, *, edge: int, learning: int, warm_up: 
         edge: of the grid.
         learning: iterations in which the field learns the scene.
         warm_up: iterations at the last size, before the field is held still.
+        trained: folder of a finished run on the scene, whose field and cells are taken as they are.
+
+    Raises:
+        InputError: if that run is missing, damaged or of another scene.
     """
-    taught = learn(config, scene, learning, edge**3)
-    settings = replace(_without_events(config).train, voxels_start=edge**3, carve=True)
-    trainer = Trainer(taught.field, scene, regularizers_of(config), settings, seed=config.seed)
-    last = max(config.train.resample_at, default=0)
-    trainer.step = middle = _middle(last, settings.steps)
-    if hasattr(trainer.field, "resample"):
-        events.resample(trainer)
-    events.update_occupancy(trainer)
+    settings = replace(_without_events(config).train, voxels_start=edge**3, carve=trained is None)
+    middle = _middle(max(config.train.resample_at, default=0), settings.steps)
+    if trained is None:
+        field = learn(config, scene, learning, edge**3).field
+        name = f"{edge}³ with occupancy"
+    else:
+        run = load_run(trained)
+        if run.fingerprint != scene.fingerprint:
+            raise InputError(f"--trained {trained}: a run on other views than those of {scene.name}")
+        run.handle.remove()
+        field = run.field.train()
+        name = f"{'x'.join(map(str, getattr(field, 'resolution', ())))} with occupancy"
+    trainer = Trainer(field, scene, regularizers_of(config), settings, seed=config.seed)
+    trainer.step = middle
+    if trained is not None:
+        trainer.occupancy = run.occupancy
+    else:
+        if hasattr(field, "resample"):
+            events.resample(trainer)
+        events.update_occupancy(trainer)
     events.filter_rays(trainer)
     trainer.train(until=min(middle + warm_up, settings.steps))
-    return _still(trainer, f"{edge}³ with occupancy", middle)
+    return _still(trainer, name, middle)
 
 
 def require_grid(trainer: Trainer, option: str) -> None:

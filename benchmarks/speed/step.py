@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import statistics
-from collections import defaultdict
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ from . import common, situations
 from .common import Record
 from .peer import Peer, load_class
 from .situations import Situation
-from .stopwatch import STAGES, watched_step
+from .stopwatch import STAGES, Stopwatch, watched_step
 
 HELP = "a training step in two situations of the schedule, by stage; beside the plain path and a peer"
 
@@ -42,6 +41,12 @@ def add_situation_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--warm-up", type=common.count, default=30, help="iterations at its last size before it is held still"
     )
+    group.add_argument(
+        "--trained",
+        type=Path,
+        metavar="DIR",
+        help="a finished run on the scene, whose field is taken as the second",
+    )
     group.add_argument("--only", choices=("early", "late"), help="one situation instead of both")
 
 
@@ -58,42 +63,47 @@ def make(arguments: argparse.Namespace, config: RunConfig, scene: Scene) -> list
     wanted: dict[str, Callable[[], Situation]] = {
         "early": lambda: situations.early(config, scene, edge=arguments.early_edge, learning=arguments.begin),
         "late": lambda: situations.late(
-            config, scene, edge=arguments.late_edge, learning=arguments.learn, warm_up=arguments.warm_up
+            config,
+            scene,
+            edge=arguments.late_edge,
+            learning=arguments.learn,
+            warm_up=arguments.warm_up,
+            trained=arguments.trained,
         ),
     }
     return [build for name, build in wanted.items() if arguments.only in (None, name)]
 
 
 class Watched:
-    """Iterations under the stopwatch: the seconds of each stage, and the share that the stages make of the whole."""
+    """Iterations under the stopwatch; of each, the whole and the seconds of every part."""
 
     def __init__(self, situation: Situation, backend: str) -> None:
         self.situation, self.backend = situation, backend
-        self.stages: defaultdict[str, list[float]] = defaultdict(list)
-        self.parts: defaultdict[str, list[float]] = defaultdict(list)
-        self.shares: list[float] = []
+        self.turns: list[tuple[float, Stopwatch]] = []
 
     def __call__(self, turn: int) -> None:
         self.situation.rewind(turn)
         with use_backend(self.backend):
-            whole, watch = watched_step(self.situation.trainer)
-        found = watch.by_stage()
-        for name, seconds in found.items():
-            self.stages[name].append(seconds)
-        for name in {*self.parts, *watch.seconds}:
-            self.parts[name].append(watch.seconds.get(name, 0.0))
-        self.shares.append(sum(found.values()) / whole)
+            self.turns.append(watched_step(self.situation.trainer))
 
     def figures(self, skip: int = 0) -> Record:
-        """Medians, without the first turns.
+        """Medians of the stages without the first turns.
 
         ``sum_of_stages`` is the share that all stages make of the whole step as a clock outside measured it.
         """
+        turns = self.turns[skip:]
+        stages = [watch.by_stage() for _, watch in turns]
+        shares = [sum(found.values()) / whole for found, (whole, _) in zip(stages, turns, strict=True)]
         return {
-            "stages": {name: statistics.median(self.stages[name][skip:]) for name in STAGES},
-            "parts": {name: statistics.median(values[skip:]) for name, values in sorted(self.parts.items())},
-            "sum_of_stages": statistics.median(self.shares[skip:]),
+            "stages": {name: statistics.median([found[name] for found in stages]) for name in STAGES},
+            "sum_of_stages": statistics.median(shares),
         }
+
+    def typical(self, skip: int = 0) -> tuple[float, dict[str, float]]:
+        """The whole and the parts of the turn that took the median time: these do add up, as medians need not."""
+        turns = sorted(self.turns[skip:], key=lambda turn: turn[0])
+        whole, watch = turns[(len(turns) - 1) // 2]
+        return whole, dict(watch.seconds)
 
 
 def measure_one(situation: Situation, arguments: argparse.Namespace) -> Record:
@@ -113,6 +123,7 @@ def measure_one(situation: Situation, arguments: argparse.Namespace) -> Record:
     return {
         **situation.describe(),
         **facts,
+        "parts": watched["compiled"].typical(skip=1)[1],
         "seconds": common.medians(times),
         "ratios": common.ratios(times, "compiled"),
         "watched": {name: run.figures(skip=1) for name, run in watched.items()},

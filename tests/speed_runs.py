@@ -1,0 +1,44 @@
+"""Tiny sizes, and a caller, for the tests of benchmarks/speed.py."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+from speed import main
+
+__all__ = ["SMALL", "TINY", "one_thread", "run"]
+
+TINY = ["--set", "train.rays=48", "field.density_components=4", "field.appearance_components=6"]
+SMALL = ["train.voxels_start=512", "train.voxels_end=1728", "train.occupancy_resolution=12"]
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Commands set the number of threads of the whole process."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def run(words: list[str], results: Path, capsys: pytest.CaptureFixture[str]) -> tuple[dict[str, Any], str]:
+    """Run a command; what it stored and what it printed."""
+    before = set(results.glob("*.json"))
+    assert main.main([*words, "--threads", "1", "--results", str(results)]) == 0
+    (target,) = set(results.glob("*.json")) - before
+    record = json.loads(target.read_text())
+    assert record["threads"] == record["versions"]["threads"] == 1
+    assert target.name.startswith(words[0])
+    assert str(results) not in target.read_text()
+    return record, capsys.readouterr().out
