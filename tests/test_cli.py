@@ -288,12 +288,16 @@ def test_bench_lists_and_runs(
     (tmp_path / "gridreg").mkdir()
     (tmp_path / "benchmarks").mkdir()
     (tmp_path / "pyproject.toml").write_text("")
-    program = '"""Adds up.\n\nMore."""\nimport sys\nprint(sum(map(int, sys.argv[1:])))\nsys.exit(7)\n'
+    program = '"""Adds up.\n\nMore."""\nimport sys\nassert __name__ == "__main__"\n'
+    program += "print(sum(map(int, sys.argv[1:])))\nsys.exit(7)\n"
     (tmp_path / "benchmarks/adds.py").write_text(program)
-    (tmp_path / "benchmarks/quiet.py").write_text("value = 1\n")
+    (tmp_path / "benchmarks/quiet.py").write_text("value = __name__ == '__main__'\n")
+    (tmp_path / "benchmarks/shared.py").write_text("value = 1\n")
     before = sys.argv[:]
     assert main(["bench"]) == 0
-    assert "adds   Adds up." in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "adds   Adds up." in printed
+    assert "shared" not in printed
     assert main(["bench", "adds", "2", "3"]) == 7
     assert capsys.readouterr().out == "5\n"
     assert main(["bench", "quiet"]) == 0

@@ -42,7 +42,9 @@ def benchmarks() -> dict[str, Path]:
     for place in places:
         folder = place / "benchmarks"
         if (place / "pyproject.toml").is_file() and folder.is_dir() and (place / "gridreg").is_dir():
-            return {path.stem: path for path in sorted(folder.glob("*.py")) if not path.stem.startswith("_")}
+            # Beside the programs lie the modules that they share.
+            programs = [path for path in sorted(folder.glob("*.py")) if "__main__" in path.read_text("utf-8")]
+            return {path.stem: path for path in programs}
     raise InputError(
         f"bench: gridreg is installed in {places[0]} without its benchmarks; "
         "expected a checkout of the repository: run it from there"
