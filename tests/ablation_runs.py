@@ -72,3 +72,17 @@ def write_study(folder: Path, more: str = "", **options: str) -> Path:
     path = folder / "tiny.yaml"
     path.write_text(study_text(more, **options), encoding="utf-8")
     return path
+
+
+def assert_same_numbers(found: dict[str, Any], expected: dict[str, Any], bound: float = 1e-3) -> None:
+    """Metrics of images computed by different processes.
+
+    Kernels that two processes compile at the same moment may round differently, so numbers across processes are equal
+    up to ``bound`` (dB, or unitless) where nobody has compiled them before.
+    """
+    assert found.keys() == expected.keys()
+    for key, value in found.items():
+        if isinstance(value, dict):
+            assert_same_numbers(value, expected[key], bound)
+        else:
+            assert abs(value - expected[key]) <= bound, (key, value, expected[key])

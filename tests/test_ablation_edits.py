@@ -89,7 +89,7 @@ def test_remove():
         "TotalVariation density.planes",
         "TotalVariation appearance.planes",
     ]
-    assert len(removed(FEW, "TotalVariation density")) == len(FEW) - 1
+    assert len(removed(FEW, "TotalVariation density.planes")) == len(FEW) - 1
 
 
 def test_removing_what_is_not_there_says_what_is():
