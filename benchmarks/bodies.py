@@ -127,6 +127,8 @@ def draw(subject: Path, protocols: list[str], arguments: argparse.Namespace) -> 
 
 def _shown(mesh: Mesh, places: list[Camera]) -> np.ndarray:
     shapes = [mesh_picture(mesh, camera, coloured=False) for camera in places]
+    if mesh.colours is None:
+        return row(shapes)
     return row([*shapes, *(mesh_picture(mesh, camera, coloured=True) for camera in places)])
 
 

@@ -9,7 +9,7 @@ from gridreg.export import Camera, Mesh
 from gridreg.export.compare import sample_surface
 
 
-def mesh_picture(mesh: Mesh, camera: Camera, *, coloured: bool, samples: int = 600_000) -> np.ndarray:
+def mesh_picture(mesh: Mesh, camera: Camera, *, coloured: bool, samples: int = 1_500_000) -> np.ndarray:
     """A picture ``(H, W, 3)`` uint8 of a mesh on white, lit from the camera.
 
     Args:
