@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import shutil
 import sys
 import tempfile
 from pathlib import Path
@@ -94,7 +95,7 @@ def with_true_cameras(scene: Path, out: Path, truth: dict[str, Array], focal: fl
         for frame, pose in zip(content["frames"], moved, strict=True)
     ]
     out.mkdir()
-    (out / "images").symlink_to((scene / "images").resolve())
+    shutil.copytree(scene / "images", out / "images")
     write_json(out / "transforms.json", {**lens, "gridreg": content["gridreg"], "frames": frames})
     turns = np.einsum("nij,nij->n", estimated[:, :3, :3], moved[:, :3, :3])
     angles = np.degrees(np.arccos(np.clip((turns - 1) / 2, -1, 1)))
