@@ -323,19 +323,21 @@ def test_several_threads_open_one_store(tmp_path):
     """Whoever comes first makes the tables; nobody fails."""
     errors = []
 
-    def work():
+    def work(folder):
         try:
-            Store.open(tmp_path / "new").add(study_of(spec("a")))
+            Store.open(folder).add(study_of(spec("a")))
         except Exception as error:
             errors.append(error)
 
-    threads = [threading.Thread(target=work) for _ in range(6)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert errors == []
-    assert len(Store.open(tmp_path / "new").results()) == 1
+    for turn in range(10):
+        folder = tmp_path / f"new{turn}"
+        threads = [threading.Thread(target=work, args=(folder,)) for _ in range(6)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert errors == []
+        assert len(Store.open(folder).results()) == 1
 
 
 def test_no_store(tmp_path):

@@ -89,7 +89,10 @@ class Database:
         if not create and not path.is_file():
             raise InputError(f"{path}: no such file; expected the database of a store")
         with self._errors(), contextlib.closing(self._connect()) as connection:
+            # One moment for all questions: another process may be making the tables just now.
+            connection.execute("BEGIN")
             self._is_ours(connection)
+            connection.execute("COMMIT")
             self.note = self._set_journal(connection)
             connection.execute("BEGIN IMMEDIATE")
             if not self._is_ours(connection):
