@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from backbones import kernels
 from backbones.kernels.linear import Precision
+from gridreg.attach import open_channels
 from gridreg.encodings import octaves_of_channels
 from gridreg.sites import Site, inputs, parameters
 
@@ -105,9 +106,28 @@ class MLPDecoder(nn.Module):
         ]
         if self.position_octaves is not None:
             blocks.append(kernels.Block(positions, self.position_octaves))
-        layers = [(layer.weight, layer.bias) for layer in self.layers]
+        blocks, first = self._open(blocks)
+        layers = [(first, self.layers[0].bias), *((layer.weight, layer.bias) for layer in self.layers[1:])]
         out = kernels.encoded_mlp(blocks, layers, precision=self.precision)  # type: ignore[arg-type]
         return torch.sigmoid(out)
+
+    def _open(self, blocks: list[kernels.Block]) -> tuple[list[kernels.Block], Tensor]:
+        """The encodings without the octaves that masks have closed altogether, and the weight's columns for them."""
+        parts, kept, start = [], [], 0
+        for block in blocks:
+            columns = slice(start, start + block.width)
+            start += block.width
+            opened = open_channels(self.layers[0], "weight", columns)
+            if opened is not None:
+                dims = block.x.shape[1]
+                octaves = max(0, -(-(opened - dims) // (2 * dims)))
+                block = block._replace(octaves=octaves)
+            kept.append(slice(columns.start, columns.start + block.width))
+            parts.append(block)
+        weight: Tensor = self.layers[0].weight  # type: ignore[assignment]
+        if all(a.octaves == b.octaves for a, b in zip(parts, blocks, strict=True)):
+            return blocks, weight
+        return parts, torch.cat([weight[:, columns] for columns in kept], dim=1)
 
     def sites(self, prefix: str) -> dict[str, Site]:
         """The encodings' sites: columns of the first weight, each with its octave."""

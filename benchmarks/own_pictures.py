@@ -2,9 +2,10 @@
 
     python benchmarks/own_pictures.py
 
-Takes pictures of the built-in scene on white, as a person would have them (JPEG, focal length in EXIF), throws the
-cameras away, lets `prepare` find them (pycolmap), and trains on the same pictures with the estimated and with the true
-cameras, in the same world and box. JSON in benchmarks/results/own_pictures/.
+Takes pictures of the built-in scene on white, as a person would have them (JPEG of 1,200 pixels, focal length in
+EXIF), throws the cameras away, lets `prepare` find them (pycolmap) and reduce the pictures, and trains on the same
+pictures with the estimated and with the true cameras, in the same world and box. JSON in
+benchmarks/results/own_pictures/.
 """
 
 from __future__ import annotations
@@ -49,9 +50,13 @@ def take_pictures(folder: Path, poses: list[Array], size: int) -> float:
     folder.mkdir()
     focal = size / 2 / math.tan(FIELD_OF_VIEW / 2)
     exif = Image.Exif()
-    exif[ExifTags.IFD.Exif] = {ExifTags.Base.FocalLengthIn35mmFilm: round(36 * focal / size)}
+    # Equivalent by the diagonal, as of a film of 36 by 24 mm.
+    equivalent = focal * math.hypot(36, 24) / math.hypot(size, size)
+    exif[ExifTags.IFD.Exif] = {ExifTags.Base.FocalLengthIn35mmFilm: round(equivalent)}
     for k, pose in enumerate(poses):
-        rgba = render_rgba(pose, np.array([focal, focal, size / 2, size / 2]), size, size, samples=2)
+        rgba = render_rgba(
+            pose, np.array([focal, focal, size / 2, size / 2]), size, size, samples=1 if size > 800 else 2
+        )
         picture = rgba[..., :3] * rgba[..., 3:] + 1 - rgba[..., 3:]
         pixels = np.rint(255 * np.clip(picture, 0, 1)).astype(np.uint8)
         Image.fromarray(pixels).save(folder / f"picture_{k:03d}.jpg", quality=95, exif=exif)
@@ -126,10 +131,11 @@ def score(folder: Path, out: Path, arguments: argparse.Namespace) -> dict[str, A
 
 def run(arguments: argparse.Namespace, scratch: Path) -> dict[str, Any]:
     poses = poses_around(arguments.pictures)
-    focal = take_pictures(scratch / "pictures", poses, arguments.size)
+    focal = take_pictures(scratch / "pictures", poses, arguments.taken) * arguments.size / arguments.taken
     made = prepare(
         scratch / "pictures",
         scratch / "estimated",
+        longest_edge=arguments.size,
         progress=lambda stage: print(f"{stage} ...", file=sys.stderr, flush=True),
     )
     print(made, flush=True)
@@ -138,6 +144,7 @@ def run(arguments: argparse.Namespace, scratch: Path) -> dict[str, Any]:
     print("estimated cameras:", {name: f"{value:.2g}" for name, value in errors.items()}, flush=True)
     figures: dict[str, Any] = {
         "pictures": len(poses),
+        "taken": arguments.taken,
         "size": arguments.size,
         "registered": len(made.registered),
         "camera_errors": errors,
@@ -157,7 +164,8 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--pictures", type=int, default=40)
-    parser.add_argument("--size", type=int, default=400, help="pixels")
+    parser.add_argument("--taken", type=int, default=1200, help="pixels of the pictures that are taken")
+    parser.add_argument("--size", type=int, default=400, help="pixels of the pictures that are trained on")
     parser.add_argument("--preset", default="quick")
     parser.add_argument("--steps", type=int, help="iterations; the schedule's events move in proportion")
     parser.add_argument("--seed", type=int, default=0)

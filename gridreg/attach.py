@@ -29,7 +29,7 @@ class Slot:
     Attributes:
         owner: token of the handle that it belongs to.
         active: False while the transform is the identity and is skipped.
-        open: channels at and beyond this index are closed, or None.
+        closed: which channels of the tensor are exactly 0, ``(channels,)`` bool; None if none are.
     """
 
     def __init__(self, owner: str, regularizer: Regularizer, context: Context) -> None:
@@ -38,7 +38,7 @@ class Slot:
         self.context = context
         self.train_only = type(regularizer).train_only
         self.active = True
-        self.open: int | None = None
+        self.closed: Tensor | None = None
 
     def refresh(self, prepare: bool = True) -> None:
         """Bring the slot up to the context's step, if its channels are known yet."""
@@ -54,7 +54,7 @@ class Slot:
                 self.regularizer.prepare(self.context)
             self.context.prepared_at = self.context.step
         self.active = not self.regularizer.is_identity(self.context)
-        self.open = self.regularizer.open_channels(self.context) if self.active else None
+        self.closed = self.regularizer.closed_channels(self.context) if self.active else None
 
     def __call__(self, value: Tensor, training: bool) -> Tensor:
         """The transformed tensor, or `value` itself."""
@@ -192,15 +192,16 @@ def slots_of(module: nn.Module) -> Iterator[Slot]:
             yield hook.slot
 
 
-def open_channels(module: nn.Module, name: str) -> int | None:
+def open_channels(module: nn.Module, name: str, channels: slice | None = None) -> int | None:
     """Channels of a parameter that a field need not read: those at and beyond this index are closed by a
     mask.
 
-    Cheap enough for a hot path: the number is computed once per step.
+    Cheap enough for a hot path: what a mask closes is found once per step.
 
     Args:
         module: the module that holds the parameter, or one above it.
         name: the parameter's name from there ("0" in a `ParameterList`, "density_lines.0" from the field).
+        channels: look at this part alone, such as ``slice(27, 81)``; the index counts from its start.
 
     Returns:
         The index, or None if nothing is attached or no channel at the end is closed.
@@ -211,5 +212,12 @@ def open_channels(module: nn.Module, name: str) -> int | None:
     stacks = module.__dict__.get(STACKS)
     if stacks is None:
         return None
-    closed = [slot.open for slot in stacks.get(name, ()) if slot.active and slot.open is not None]
-    return min(closed) if closed else None
+    closed = [slot.closed for slot in stacks.get(name, ()) if slot.active and slot.closed is not None]
+    if not closed:
+        return None
+    together = closed[0] if len(closed) == 1 else torch.stack(closed).any(dim=0)
+    together = together if channels is None else together[channels]
+    if not bool(together[-1:].any()):
+        return None
+    opened = (~together).nonzero()
+    return int(opened[-1]) + 1 if len(opened) else 0

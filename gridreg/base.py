@@ -154,8 +154,8 @@ class Regularizer:
         """True: from this step on it is the identity for good, so a slot that is idle already need not ask again."""
         return False
 
-    def open_channels(self, context: Context) -> int | None:
-        """Channels at and beyond this index are exactly 0 after `transform`; None: no such tail."""
+    def closed_channels(self, context: Context) -> Tensor | None:
+        """Which of the tensor's channels are exactly 0 after `transform`: ``(channels,)`` bool; None: none are."""
         return None
 
     def gradient_only(self) -> bool:

@@ -77,12 +77,10 @@ class Mask(Regularizer):
         """Whether values stay and only gradients change."""
         return self.detach
 
-    def open_channels(self, context: Context) -> int | None:
-        """Index of the first channel of a closed tail."""
-        mask = context.state["mask"]
-        opened = mask.nonzero()
-        count = int(opened[-1]) + 1 if len(opened) else 0
-        return None if self.detach or count == len(mask) else count
+    def closed_channels(self, context: Context) -> Tensor | None:
+        """Where the mask is 0."""
+        closed: Tensor = context.state["mask"] <= 0
+        return None if self.detach else closed
 
     def transform(self, value: Tensor, context: Context) -> Tensor:
         """Multiply the channels by the mask."""

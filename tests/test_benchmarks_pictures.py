@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -54,7 +55,7 @@ def test_pictures_are_as_a_phone_takes_them(tmp_path: Path) -> None:
         assert picture.size == (24, 24)
         assert picture.mode == "RGB"
         noted = picture.getexif().get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm]
-    assert noted == pytest.approx(36 * focal / 24, abs=0.5)
+    assert noted == pytest.approx(focal * math.hypot(36, 24) / math.hypot(24, 24), abs=0.5)
 
 
 def test_true_cameras_in_the_world_of_a_prepared_scene(tmp_path: Path) -> None:

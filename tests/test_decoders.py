@@ -5,6 +5,8 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
+import gridreg
+from backbones import decoders, kernels
 from backbones.decoders import MLPDecoder, make_decoder, spherical_harmonics
 
 
@@ -54,6 +56,47 @@ def test_encoding_sites_cover_the_columns_and_know_their_octaves():
         assert list(selector.octaves) == expected
         covered.append(selector.channels)
     assert "encoding.position" not in MLPDecoder(4, position_octaves=None).sites("decoder")
+
+
+@pytest.mark.parametrize("step", [0, 1, 3, 6, 9, 10])
+@pytest.mark.parametrize("precision", ["float32", "auto"])
+def test_octaves_that_masks_have_closed_are_left_out(step, precision, monkeypatch):
+    """The same colours and gradients as with all octaves and a weight of zeros, at the cost of the open ones."""
+    widths = []
+    whole = kernels.encoded_mlp
+
+    def spied(blocks, layers, **options):
+        widths.append(layers[0][0].shape[1])
+        return whole(blocks, layers, **options)
+
+    monkeypatch.setattr(kernels, "encoded_mlp", spied)
+    decoder = MLPDecoder(
+        4, feature_octaves=2, direction_octaves=3, position_octaves=3, width=16, precision=precision
+    )
+    f, d, x = torch.randn(40, 4), normalize(torch.randn(8, 3), dim=-1), torch.rand(40, 3) * 2 - 1
+    rays = torch.randint(8, (40,))
+    upstream = torch.randn(40, 3)
+    masks = [
+        gridreg.FrequencyMask(site, until=until)
+        for site, until in zip(decoder.sites("decoder").values(), (5, 10, 7), strict=True)
+    ]
+    field = torch.nn.ModuleDict({"decoder": decoder})
+    found, handle = [], gridreg.apply(field, *masks, total_steps=10)
+    with handle:
+        handle.step(step)
+        for opened in (gridreg.open_channels, lambda *arguments: None):
+            monkeypatch.setattr(decoders, "open_channels", opened)
+            inputs = [value.clone().requires_grad_() for value in (f, x)]
+            out = decoder(inputs[0], d, inputs[1], rays)
+            parameters = [p for _, p in sorted(decoder.named_parameters())]
+            found.append([out.detach(), *torch.autograd.grad((out * upstream).sum(), [*inputs, *parameters])])
+    tolerance = 1e-5 if precision == "float32" else 2e-2
+    for ours, expected in zip(*found, strict=True):
+        torch.testing.assert_close(
+            ours, expected, rtol=tolerance, atol=tolerance * float(expected.abs().max())
+        )
+    assert widths[1] == 4 * 5 + 3 * 7 + 3 * 7
+    assert widths[0] < widths[1] if step <= 3 else widths[0] <= widths[1]
 
 
 def test_spherical_harmonics_are_orthonormal_on_the_sphere():

@@ -104,6 +104,28 @@ class TestFromCameras:
         torch.testing.assert_close(after.train.rgba, rgba[rows])
         torch.testing.assert_close(after.train.intrinsics, intrinsics[rows])
 
+    def test_reduces_large_pictures_with_their_cameras_and_masks(self, posed: Path, tmp_path: Path) -> None:
+        content = json.loads((posed / "transforms.json").read_text())
+        content.update(fl_x=21.0, fl_y=22.0, cx=8.5, cy=7.5, w=SIZE, h=SIZE)
+        (posed / "transforms.json").write_text(json.dumps(content))
+        (tmp_path / "masks").mkdir()
+        for k in range(18):
+            mask = np.zeros((SIZE, SIZE), dtype=np.uint8)
+            mask[:, : SIZE // 2] = 255
+            Image.fromarray(mask).convert("1").save(tmp_path / f"masks/r_{k}.png")
+            picture = np.zeros((SIZE, SIZE, 3), dtype=np.uint8)
+            picture[: SIZE // 2], picture[1::2, :, 1] = (10 * k, 0, 200), 100
+            Image.fromarray(picture).save(posed / f"pictures/r_{k}.png")
+        prepare(posed, tmp_path / "out", masks=tmp_path / "masks", longest_edge=SIZE // 2)
+        prepare(posed, tmp_path / "same", masks=tmp_path / "masks", longest_edge=SIZE)
+        small, large = load_scene(tmp_path / "out", "holdout8"), load_scene(tmp_path / "same", "holdout8")
+        assert small.train.rgba.shape[1:] == (SIZE // 2, SIZE // 2, 4)
+        expected = large.train.rgba.unflatten(1, (-1, 2)).unflatten(3, (-1, 2)).mean(dim=(2, 4))
+        torch.testing.assert_close(small.train.rgba, expected, atol=1 / 255, rtol=0)
+        torch.testing.assert_close(small.train.intrinsics, large.train.intrinsics / 2)
+        assert torch.equal(small.train.poses, large.train.poses)
+        refused(posed, tmp_path / "none", "longest_edge: found 0, expected at least 8 pixels", longest_edge=0)
+
     def test_a_folder_of_masks(self, posed: Path, tmp_path: Path) -> None:
         (tmp_path / "masks").mkdir()
         for k in range(18):

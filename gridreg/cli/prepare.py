@@ -36,6 +36,8 @@ class PrepareOptions:
     """Distance from a camera where looking begins, world units of the made scene; default: from cameras and points."""
     far: OptionalFloat = None
     """Distance from a camera where looking ends, likewise."""
+    longest_edge: int = 800
+    """Pixels; larger pictures are reduced to this once their cameras are known."""
     box: Box = None
     """Lower and upper corner, world units of the made scene; default: from cameras and points."""
 
@@ -62,6 +64,7 @@ def run(options: PrepareOptions) -> int:
         near=options.near,
         far=options.far,
         bounds=box,
+        longest_edge=options.longest_edge,
         progress=say,
     )
     print(made)

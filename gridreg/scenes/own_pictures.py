@@ -20,7 +20,7 @@ from gridreg.scenes.colmap_model import read_model
 from gridreg.scenes.frames import Frame, SceneFiles, resolve_inside
 from gridreg.scenes.images import copy_upright, read_rgba
 
-__all__ = ["attach_masks", "copy_frames", "copy_pictures", "find_cameras"]
+__all__ = ["attach_masks", "copy_frames", "copy_pictures", "find_cameras", "shrink_pictures"]
 
 Progress = Callable[[str], None]
 
@@ -161,3 +161,28 @@ def _copy_mask(mask: Path, scene: Path, name: str) -> str:
     place = f"masks/{name}{mask.suffix}"
     copy_upright(mask, scene / place)
     return place
+
+
+def shrink_pictures(frames: list[Frame], scene: Path, longest: int) -> tuple[int, int]:
+    """Reduce the pictures and masks of a scene in place, so that their longer edge is at most ``longest`` pixels.
+
+    Returns:
+        Width and height of the pictures now.
+    """
+    with Image.open(scene / frames[0].file_path) as first:
+        old: tuple[int, int] = first.size
+    share = longest / max(old)
+    if share >= 1:
+        return old
+    new = max(1, round(old[0] * share)), max(1, round(old[1] * share))
+    for frame in frames:
+        for name in (frame.file_path, frame.mask_path):
+            if name is None:
+                continue
+            path = scene / name
+            with Image.open(path) as opened:
+                picture = opened
+                if opened.mode in ("1", "P"):
+                    picture = opened.convert("RGBA" if opened.has_transparency_data else "RGB")
+                picture.resize(new, Image.Resampling.BOX).save(path, quality=95)
+    return new

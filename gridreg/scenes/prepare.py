@@ -19,7 +19,13 @@ from gridreg.scenes.drawing import draw_cameras
 from gridreg.scenes.extent import Extent, box_is_seen, camera_extent, points_extent
 from gridreg.scenes.frames import Camera, Frame
 from gridreg.scenes.load import NotASceneError, read_folder
-from gridreg.scenes.own_pictures import attach_masks, copy_frames, copy_pictures, find_cameras
+from gridreg.scenes.own_pictures import (
+    attach_masks,
+    copy_frames,
+    copy_pictures,
+    find_cameras,
+    shrink_pictures,
+)
 from gridreg.scenes.transforms import EXTENT_KEY
 
 __all__ = ["Prepared", "prepare"]
@@ -65,6 +71,7 @@ def prepare(
     near: float | None = None,
     far: float | None = None,
     bounds: Sequence[Sequence[float]] | None = None,
+    longest_edge: int = 800,
     progress: Callable[[str], None] = lambda stage: None,
 ) -> Prepared:
     """Make a scene folder: upright pictures, ``transforms.json``, and a drawing of the cameras and the box.
@@ -82,6 +89,8 @@ def prepare(
         near: distance from a camera where looking begins, world units of the made scene, instead of the derived one.
         far: distance from a camera where looking ends, likewise.
         bounds: ``(2, 3)`` lower and upper corner, likewise; the world stays turned, centred and scaled as derived.
+        longest_edge: pixels; larger pictures are reduced (by area) once their cameras are known, as the photographs
+            of a telephone would fill the memory and show no more than the grid can hold.
         progress: called with the name of each stage.
 
     Raises:
@@ -94,6 +103,8 @@ def prepare(
         raise InputError(f"{source}: no such folder of pictures")
     if out.exists():
         raise InputError(f"{out}: exists already, expected the name of a new folder")
+    if longest_edge < 8:
+        raise InputError(f"longest_edge: found {longest_edge}, expected at least 8 pixels")
     scratch: Path | None = None
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -105,7 +116,7 @@ def prepare(
             frames = attach_masks(frames, Path(masks), scene)
         progress("box")
         frames, extent = _write(
-            frames, points, scene, lambda derived: _overridden(derived, near, far, bounds)
+            frames, points, scene, longest_edge, lambda derived: _overridden(derived, near, far, bounds)
         )
         scene.rename(out)
     except OSError as error:
@@ -147,7 +158,11 @@ def _overridden(
 
 
 def _write(
-    frames: list[Frame], points: Array | None, scene: Path, override: Callable[[Extent], Extent]
+    frames: list[Frame],
+    points: Array | None,
+    scene: Path,
+    longest_edge: int,
+    override: Callable[[Extent], Extent],
 ) -> tuple[list[Frame], Extent]:
     """Write ``transforms.json`` and ``cameras.png`` in normalised coordinates."""
     with Image.open(scene / frames[0].file_path) as image:
@@ -172,7 +187,8 @@ def _write(
         )
     frames = [replace(frame, pose=pose) for frame, pose in zip(frames, poses, strict=True)]
     content = {EXTENT_KEY: {"near": extent.near, "far": extent.far, "bounds": extent.bounds.tolist()}}
-    cameras = [_camera_keys(frame.camera, size) for frame in frames]
+    reduced = shrink_pictures(frames, scene, longest_edge)
+    cameras = [_camera_keys(frame.camera, size, reduced) for frame in frames]
     shared = cameras[0] if all(camera == cameras[0] for camera in cameras) else {}
     listed = [
         {
@@ -203,7 +219,17 @@ def _upwards(up: Array) -> Array:
     return np.asarray(np.eye(3) + cross + cross @ cross / (1 + z))
 
 
-def _camera_keys(camera: Camera, size: tuple[int, int]) -> dict[str, Any]:
+def _camera_keys(camera: Camera, size: tuple[int, int], reduced: tuple[int, int]) -> dict[str, Any]:
+    """A camera of pictures of ``size`` that are now ``reduced``."""
     fx, fy, cx, cy = camera.intrinsics(*size)
+    x, y = reduced[0] / size[0], reduced[1] / size[1]
     lens = {key: value for key, value in asdict(camera.distortion).items() if value}
-    return {"w": size[0], "h": size[1], "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, **lens}
+    return {
+        "w": reduced[0],
+        "h": reduced[1],
+        "fl_x": fx * x,
+        "fl_y": fy * y,
+        "cx": cx * x,
+        "cy": cy * y,
+        **lens,
+    }
