@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import textwrap
+from threading import Thread
 
 import pytest
 import torch
@@ -156,6 +157,24 @@ def test_kernels_of_other_versions_are_forgotten(tmp_path):
     compiler._forget_outdated.cache_clear()
     compiler._forget_outdated(str(tmp_path))
     assert stale.exists()
+
+
+@pytest.mark.skipif(compiler.fcntl is None, reason="files cannot be locked here")
+def test_one_process_compiles_while_others_wait(tmp_path):
+    folder, order = str(tmp_path / "cache"), []
+
+    def second():
+        with compiler._one_process(folder):
+            order.append("second")
+
+    with compiler._one_process(folder):
+        # A file opened anew has a lock of its own, as another process has.
+        other = Thread(target=second)
+        other.start()
+        other.join(0.2)
+        order.append("first")
+    other.join(10)
+    assert order == ["first", "second"]
 
 
 def run_script(text):

@@ -20,11 +20,13 @@ of a second, and a slice or a new array in a kernel costs several.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import threading
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +37,11 @@ from numba.core import cgutils
 from numba.core.caching import FunctionCache
 from numba.core.errors import NumbaWarning
 from numba.np import arrayobj
+
+try:
+    import fcntl
+except ImportError:  # Windows has no such lock.
+    fcntl = None  # type: ignore[assignment]
 
 __all__ = [
     "Kernel",
@@ -99,14 +106,31 @@ class Kernel:
             warnings.simplefilter("ignore", NumbaWarning)
             try:
                 cache = FunctionCache(self.function)  # type: ignore[no-untyped-call]
-                _forget_outdated(cache.cache_path)
-                return compiled(cache=True)(self.function)
+                with _one_process(cache.cache_path):
+                    _forget_outdated(cache.cache_path)
+                    return compiled(cache=True)(self.function)
             except (RuntimeError, OSError):
                 # No folder to keep a cache in: neither beside the source nor in the user's.
                 return compiled(cache=False)(self.function)
 
 
 kernel = Kernel
+
+
+@contextmanager
+def _one_process(folder: str) -> Iterator[None]:
+    """While one process compiles, others wait, and then read what it has left in the cache.
+
+    That spares the work; and code that two processes generate may differ in the order of its sums, so that their
+    numbers would differ in the last digits. Where files cannot be locked, each process goes on alone.
+    """
+    Path(folder).mkdir(parents=True, exist_ok=True)
+    with (Path(folder) / "gridreg-kernels.lock").open("a") as lock:
+        if fcntl is not None:
+            with contextlib.suppress(OSError):
+                fcntl.flock(lock, fcntl.LOCK_EX)
+        # Closing the file unlocks it.
+        yield
 
 
 @functools.cache
