@@ -19,7 +19,7 @@ from gridreg.scenes.llff import read_llff
 from gridreg.scenes.protocols import Protocol, get_protocol
 from gridreg.scenes.reader import ViewReader
 from gridreg.scenes.transforms import read_transforms
-from gridreg.scenes.views import Scene, Views, background_colour
+from gridreg.scenes.views import Scene, Views, backdrop, background_colour
 
 __all__ = ["BUILTIN_MARKER", "NotASceneError", "default_protocol", "load_scene", "read_folder"]
 
@@ -52,7 +52,7 @@ def load_scene(
         test: indices into the test frames instead of the protocol's; an empty one reads none.
         validation: indices into the training frames, or how many to take, evenly spread, of those that the
             protocol does not train on.
-        background: instead of the protocol's.
+        background: instead of the protocol's, and of the one colour that opaque pictures may have along their edges.
         near: world units, instead of what the format or the cameras say.
         far: likewise.
         bounds: ``(2, 3)`` lower and upper corner, likewise.
@@ -81,6 +81,9 @@ def load_scene(
     test_views, _ = reader.read(files.test, test_ids)
     validation_views = None if validation is None else reader.read(files.train, validation_ids)[0]
     extent = _extent(files, train)
+    if background is None:
+        found = backdrop(train)
+        background = protocol.background if found is None else found
     scene = Scene(
         name=folder.resolve().name,
         protocol=protocol.name,
@@ -89,7 +92,7 @@ def load_scene(
         near=extent.near if near is None else near,
         far=extent.far if far is None else far,
         bounds=_bounds(extent.bounds if bounds is None else bounds),
-        background=background_colour(protocol.background if background is None else background),
+        background=background_colour(background),
         fingerprint=fingerprint,
         builtin=(folder / BUILTIN_MARKER).is_file(),
         validation=validation_views,

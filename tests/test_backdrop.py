@@ -1,0 +1,79 @@
+"""Opaque pictures on one colour: it is the background, and random ones are left out."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+from PIL import Image
+
+from gridreg.scenes import backdrop, builtin_scene, load_scene
+from gridreg.training import RunConfig, TrainSettings, build_trainer, execute
+
+GREY = (0.8, 0.6, 0.4)
+CONFIG = RunConfig(
+    field={"density_components": 4, "appearance_components": 4, "density_shift": None, "width": 16},
+    train=TrainSettings(
+        steps=3,
+        rays=64,
+        voxels_start=1000,
+        voxels_end=1000,
+        resample_at=(),
+        occupancy_at=(),
+        shrink_at=(),
+        filter_rays_at=(),
+    ),
+    composition=[{"name": "RandomBackground"}],
+)
+
+
+@pytest.fixture(scope="module")
+def transparent(tmp_path_factory):
+    return builtin_scene(tmp_path_factory.mktemp("scene"), size=32)
+
+
+@pytest.fixture(scope="module")
+def opaque(transparent, tmp_path_factory):
+    """The built-in pictures before a sheet of paper, in one list as people's own pictures are."""
+    folder = tmp_path_factory.mktemp("opaque")
+    content = json.loads((transparent / "transforms_train.json").read_text())
+    for k, frame in enumerate(content["frames"]):
+        picture = Image.open(transparent / "train" / f"r_{k}.png")
+        paper = Image.new("RGBA", picture.size, tuple(round(255 * c) for c in GREY))
+        Image.alpha_composite(paper, picture).convert("RGB").save(folder / f"r_{k}.png")
+        frame["file_path"] = f"r_{k}.png"
+    (folder / "transforms.json").write_text(json.dumps(content))
+    return folder
+
+
+def behind(trainer):
+    """Background colours of a batch of training rays."""
+    return trainer.render_batch()[0].samples.background
+
+
+def test_the_paper_is_the_background(opaque, tmp_path, capfd):
+    scene = load_scene(opaque, "holdout8")
+    torch.testing.assert_close(scene.background, torch.tensor(GREY), atol=1e-2, rtol=0)
+    trainer = build_trainer(CONFIG, scene)
+    assert torch.equal(behind(trainer), scene.background.expand(64, 3))
+    execute(CONFIG, scene, tmp_path / "run")
+    said = "".join(capfd.readouterr())
+    assert "opaque pictures on one colour (0.80, 0.60, 0.40): it is the background" in said
+    given = load_scene(opaque, "holdout8", background="black")
+    assert given.background.tolist() == [0, 0, 0]
+
+
+def test_transparent_pictures_keep_random_backgrounds(transparent):
+    scene = load_scene(transparent, "builtin8", test=[])
+    assert backdrop(scene.train) is None
+    assert scene.background.tolist() == [1, 1, 1]
+    assert behind(build_trainer(CONFIG, scene)).std() > 0.1
+
+
+def test_a_room_is_no_backdrop(opaque):
+    scene = load_scene(opaque, "holdout8")
+    rgba = scene.train.rgba.clone()
+    rgba[:, :4, :, :3] = torch.rand(rgba[:, :4, :, :3].shape, generator=torch.Generator().manual_seed(0))
+    room = replace(scene, train=replace(scene.train, rgba=rgba))
+    assert backdrop(room.train) is None
+    assert behind(build_trainer(CONFIG, room)).std() > 0.1
