@@ -78,7 +78,10 @@ def reconstruct(subject: Path, protocol: str, arguments: argparse.Namespace) -> 
         renders = [picture(model.render(camera), "rgb") for camera in cameras(truth)]  # type: ignore[arg-type]
     comparison = compare_meshes(mesh, truth)
     metrics["config"] = {**metrics["config"], "scene": subject.name}
-    metrics["command"] = ["benchmarks/bodies.py", *sys.argv[1:]]
+    metrics["command"] = [
+        "benchmarks/bodies.py",
+        *("DIR" if Path(word).is_absolute() else word for word in sys.argv[1:]),
+    ]
     metrics["mesh"] = {
         **comparison.to_dict(),
         "watertight": mesh.watertight,

@@ -148,7 +148,10 @@ def run(arguments: argparse.Namespace, scratch: Path) -> dict[str, Any]:
         "size": arguments.size,
         "registered": len(made.registered),
         "camera_errors": errors,
-        "command": ["benchmarks/own_pictures.py", *sys.argv[1:]],
+        "command": [
+            "benchmarks/own_pictures.py",
+            *("DIR" if Path(word).is_absolute() else word for word in sys.argv[1:]),
+        ],
     }
     if arguments.cameras_only:
         return figures

@@ -120,7 +120,9 @@ def test_a_chart_of_nothing_is_nothing() -> None:
 def test_one_point_is_a_dot_without_a_line() -> None:
     chart = chart_of([Series("a", "s1", [(3.0, 20.0)], [(3.0, 20.0)])])
     assert not list(chart.iter("polyline"))
-    assert len(list(chart.iter("circle"))) == 1
+    radii = [float(dot.attrib["r"]) for dot in chart.iter("circle")]
+    assert len(radii) == 2
+    assert radii[0] < radii[1]
 
 
 def test_many_lines_make_a_taller_chart_and_long_names_are_cut() -> None:

@@ -127,11 +127,13 @@ def line_chart(
         f'preserveAspectRatio="none">{"".join(lines)}</svg>'
     )
     for line in series:
-        for x, y in line.marks:
+        # One point makes no line: it is drawn as a smaller dot.
+        alone = [(place, "2.5") for place in line.points] if len(line.points) == 1 else []
+        for (x, y), radius in [*alone, *((place, "4") for place in line.marks)]:
             if y >= bottom:
                 parts.append(
                     f'<circle class="{line.style}" data-series="{_text(line.name)}" cx="{across(x):.2f}%" '
-                    f'cy="{down(y):.1f}" r="4"/>'
+                    f'cy="{down(y):.1f}" r="{radius}"/>'
                 )
     parts += _end_labels(series, down, height)
     return (
