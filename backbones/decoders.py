@@ -113,21 +113,20 @@ class MLPDecoder(nn.Module):
 
     def _open(self, blocks: list[kernels.Block]) -> tuple[list[kernels.Block], Tensor]:
         """The encodings without the octaves that masks have closed altogether, and the weight's columns for them."""
-        parts, kept, start = [], [], 0
+        parts, columns, start = [], [], 0
         for block in blocks:
-            columns = slice(start, start + block.width)
-            start += block.width
-            opened = open_channels(self.layers[0], "weight", columns)
+            stop = start + block.width
+            opened = open_channels(self.layers[0], "weight", slice(start, stop))
             if opened is not None:
                 dims = block.x.shape[1]
-                octaves = max(0, -(-(opened - dims) // (2 * dims)))
-                block = block._replace(octaves=octaves)
-            kept.append(slice(columns.start, columns.start + block.width))
+                block = block._replace(octaves=max(0, math.ceil((opened - dims) / (2 * dims))))
             parts.append(block)
+            columns.append(slice(start, start + block.width))
+            start = stop
         weight: Tensor = self.layers[0].weight  # type: ignore[assignment]
-        if all(a.octaves == b.octaves for a, b in zip(parts, blocks, strict=True)):
-            return blocks, weight
-        return parts, torch.cat([weight[:, columns] for columns in kept], dim=1)
+        if sum(part.width for part in parts) < start:
+            weight = torch.cat([weight[:, part] for part in columns], dim=1)
+        return parts, weight
 
     def sites(self, prefix: str) -> dict[str, Site]:
         """The encodings' sites: columns of the first weight, each with its octave."""

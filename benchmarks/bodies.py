@@ -21,6 +21,7 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).parent))
 from mesh_pictures import mesh_picture
+from stored_command import stored_command
 
 from gridreg.cli import ending
 from gridreg.export import (
@@ -78,10 +79,7 @@ def reconstruct(subject: Path, protocol: str, arguments: argparse.Namespace) -> 
         renders = [picture(model.render(camera), "rgb") for camera in cameras(truth)]  # type: ignore[arg-type]
     comparison = compare_meshes(mesh, truth)
     metrics["config"] = {**metrics["config"], "scene": subject.name}
-    metrics["command"] = [
-        "benchmarks/bodies.py",
-        *("DIR" if Path(word).is_absolute() else word for word in sys.argv[1:]),
-    ]
+    metrics["command"] = stored_command("benchmarks/bodies.py")
     metrics["mesh"] = {
         **comparison.to_dict(),
         "watertight": mesh.watertight,

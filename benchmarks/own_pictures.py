@@ -24,6 +24,9 @@ import torch
 from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
+sys.path.insert(0, str(Path(__file__).parent))
+from stored_command import stored_command
+
 from gridreg.cli import ending
 from gridreg.scenes import load_scene, prepare
 from gridreg.scenes.builtin.cameras import FIELD_OF_VIEW, RADIUS, look_at_origin
@@ -148,10 +151,7 @@ def run(arguments: argparse.Namespace, scratch: Path) -> dict[str, Any]:
         "size": arguments.size,
         "registered": len(made.registered),
         "camera_errors": errors,
-        "command": [
-            "benchmarks/own_pictures.py",
-            *("DIR" if Path(word).is_absolute() else word for word in sys.argv[1:]),
-        ],
+        "command": stored_command("benchmarks/own_pictures.py"),
     }
     if arguments.cameras_only:
         return figures

@@ -29,7 +29,7 @@ class Slot:
     Attributes:
         owner: token of the handle that it belongs to.
         active: False while the transform is the identity and is skipped.
-        closed: which channels of the tensor are exactly 0, ``(channels,)`` bool; None if none are.
+        closed: a byte for each channel of the tensor, 1 where it is exactly 0; None if that is not known.
     """
 
     def __init__(self, owner: str, regularizer: Regularizer, context: Context) -> None:
@@ -38,7 +38,7 @@ class Slot:
         self.context = context
         self.train_only = type(regularizer).train_only
         self.active = True
-        self.closed: Tensor | None = None
+        self.closed: bytes | None = None
 
     def refresh(self, prepare: bool = True) -> None:
         """Bring the slot up to the context's step, if its channels are known yet."""
@@ -54,7 +54,8 @@ class Slot:
                 self.regularizer.prepare(self.context)
             self.context.prepared_at = self.context.step
         self.active = not self.regularizer.is_identity(self.context)
-        self.closed = self.regularizer.closed_channels(self.context) if self.active else None
+        closed = self.regularizer.closed_channels(self.context) if self.active else None
+        self.closed = None if closed is None else closed.cpu().numpy().tobytes()
 
     def __call__(self, value: Tensor, training: bool) -> Tensor:
         """The transformed tensor, or `value` itself."""
@@ -215,9 +216,7 @@ def open_channels(module: nn.Module, name: str, channels: slice | None = None) -
     closed = [slot.closed for slot in stacks.get(name, ()) if slot.active and slot.closed is not None]
     if not closed:
         return None
-    together = closed[0] if len(closed) == 1 else torch.stack(closed).any(dim=0)
-    together = together if channels is None else together[channels]
-    if not bool(together[-1:].any()):
-        return None
-    opened = (~together).nonzero()
-    return int(opened[-1]) + 1 if len(opened) else 0
+    together = closed[0] if len(closed) == 1 else bytes(map(max, *closed))
+    first, last, _ = (channels or slice(None)).indices(len(together))
+    opened = max(0, together.rfind(b"\0", first, last) + 1 - first)
+    return None if opened == last - first else opened

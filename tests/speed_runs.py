@@ -14,11 +14,29 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 from speed import main
+from speed.work import Counts
 
-__all__ = ["SMALL", "TINY", "one_thread", "run"]
+__all__ = ["COUNTS", "SMALL", "TINY", "one_thread", "run"]
 
 TINY = ["--set", "train.rays=48", "field.density_components=4", "field.appearance_components=6"]
 SMALL = ["train.voxels_start=512", "train.voxels_end=1728", "train.occupancy_resolution=12"]
+
+COUNTS = Counts(
+    rays=5,
+    steps=70,
+    cells=27,
+    samples=11,
+    coloured=4,
+    density_channels=2,
+    appearance_channels=3,
+    density_nodes=13,
+    appearance_nodes=9,
+    features=4,
+    layers=(4 * 5 + 3 * 3 + 3 * 7, 6, 3),
+    encodings=((4, 2), (3, 1), (3, 3)),
+    parameters=50,
+    low=True,
+)
 
 
 @contextmanager

@@ -7,22 +7,14 @@ import pytest
 import torch
 from PIL import Image
 
-from gridreg.scenes import backdrop, builtin_scene, load_scene
-from gridreg.training import RunConfig, TrainSettings, build_trainer, execute
+from gridreg.scenes import builtin_scene, load_scene
+from gridreg.training import RunConfig, build_trainer, execute
+from tests.tiny_training import NO_EVENTS
 
 GREY = (0.8, 0.6, 0.4)
 CONFIG = RunConfig(
     field={"density_components": 4, "appearance_components": 4, "density_shift": None, "width": 16},
-    train=TrainSettings(
-        steps=3,
-        rays=64,
-        voxels_start=1000,
-        voxels_end=1000,
-        resample_at=(),
-        occupancy_at=(),
-        shrink_at=(),
-        filter_rays_at=(),
-    ),
+    train=replace(NO_EVENTS, steps=3),
     composition=[{"name": "RandomBackground"}],
 )
 
@@ -65,7 +57,7 @@ def test_the_paper_is_the_background(opaque, tmp_path, capfd):
 
 def test_transparent_pictures_keep_random_backgrounds(transparent):
     scene = load_scene(transparent, "builtin8", test=[])
-    assert backdrop(scene.train) is None
+    assert scene.train.backdrop is None
     assert scene.background.tolist() == [1, 1, 1]
     assert behind(build_trainer(CONFIG, scene)).std() > 0.1
 
@@ -75,5 +67,5 @@ def test_a_room_is_no_backdrop(opaque):
     rgba = scene.train.rgba.clone()
     rgba[:, :4, :, :3] = torch.rand(rgba[:, :4, :, :3].shape, generator=torch.Generator().manual_seed(0))
     room = replace(scene, train=replace(scene.train, rgba=rgba))
-    assert backdrop(room.train) is None
+    assert room.train.backdrop is None
     assert behind(build_trainer(CONFIG, room)).std() > 0.1

@@ -16,24 +16,9 @@ from gridreg.scenes import builtin_scene
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 from speed import common, machine, main, roofline, situations
-from speed.work import PARTS, Counts, Work
+from speed.work import PARTS, Work
 
-COUNTS = Counts(
-    rays=5,
-    steps=70,
-    cells=27,
-    samples=11,
-    coloured=4,
-    density_channels=2,
-    appearance_channels=3,
-    density_nodes=13,
-    appearance_nodes=9,
-    features=4,
-    layers=(4 * 5 + 3 * 3 + 3 * 7, 6, 3),
-    encodings=((4, 2), (3, 1), (3, 3)),
-    parameters=50,
-    low=True,
-)
+from tests.speed_runs import COUNTS
 
 
 def test_touched_nodes_against_sets() -> None:

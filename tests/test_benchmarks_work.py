@@ -11,24 +11,9 @@ from typing import Any
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
-from speed.work import PARTS, Counts, density_work, encoding_operations, layer_operations_backward, work
+from speed.work import PARTS, density_work, encoding_operations, layer_operations_backward, work
 
-COUNTS = Counts(
-    rays=5,
-    steps=70,
-    cells=27,
-    samples=11,
-    coloured=4,
-    density_channels=2,
-    appearance_channels=3,
-    density_nodes=13,
-    appearance_nodes=9,
-    features=4,
-    layers=(4 * 5 + 3 * 3 + 3 * 7, 6, 3),
-    encodings=((4, 2), (3, 1), (3, 3)),
-    parameters=50,
-    low=True,
-)
+from tests.speed_runs import COUNTS
 
 
 class Number:

@@ -17,8 +17,9 @@ from PIL import Image
 
 from gridreg.cli import main
 from gridreg.scenes import builtin_scene
-from gridreg.training import RunConfig, TrainSettings, build_trainer, open_scene, save_run
+from gridreg.training import RunConfig, build_trainer, open_scene, save_run
 from gridreg.training.checkpoint import FORMAT_VERSION
+from tests.tiny_training import NO_EVENTS
 
 Refused = Callable[..., str]
 SMALL = ("--steps", "5", "--set", "train.rays=64", "train.voxels_start=1000", "train.voxels_end=1000")
@@ -76,15 +77,7 @@ def empty_run(source: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         scene=str(source),
         protocol="builtin8",
         field={"density_components": 2, "appearance_components": 2, "density_shift": -40.0, "width": 8},
-        train=TrainSettings(
-            steps=1,
-            voxels_start=1000,
-            voxels_end=1000,
-            resample_at=(),
-            occupancy_at=(),
-            shrink_at=(),
-            filter_rays_at=(),
-        ),
+        train=NO_EVENTS,
     )
     trainer = build_trainer(config, open_scene(config, tmp_path_factory.getbasetemp(), test=()))
     folder = tmp_path_factory.mktemp("empty")

@@ -12,23 +12,15 @@ from gridreg.errors import InputError
 from gridreg.export import LiveView, draw_run, film_path, live_view, model_of_run, model_of_trainer
 from gridreg.export.cameras import Camera, Lens
 from gridreg.scenes import Scene, builtin_scene, load_scene
-from gridreg.training import Execution, RunConfig, TrainSettings, build_trainer, execute, load_run
+from gridreg.training import Execution, RunConfig, build_trainer, execute, load_run
 from gridreg.training.curves import History
 from gridreg.training.rays import warp_of
 from tests.export_viewing import FakeClient
 from tests.forward_scene import write_forward_scene
+from tests.tiny_training import NO_EVENTS
 
 FIELD = {"density_components": 3, "appearance_components": 3, "density_shift": None, "width": 8}
-SETTINGS = TrainSettings(
-    steps=6,
-    rays=64,
-    voxels_start=1000,
-    voxels_end=1500,
-    resample_at=(3,),
-    occupancy_at=(),
-    shrink_at=(),
-    filter_rays_at=(),
-)
+SETTINGS = replace(NO_EVENTS, steps=6, voxels_end=1500, resample_at=(3,))
 CONFIG = RunConfig(
     field=FIELD,
     train=SETTINGS,

@@ -88,11 +88,10 @@ class Database:
         self.note = ""
         if not create and not path.is_file():
             raise InputError(f"{path}: no such file; expected the database of a store")
-        with self._errors(), contextlib.closing(self._connect()) as connection:
-            # One moment for all questions: another process may be making the tables just now.
-            connection.execute("BEGIN")
+        # One moment for all questions: another process may be making the tables just now.
+        with self.reading() as connection:
             self._is_ours(connection)
-            connection.execute("COMMIT")
+        with self._errors(), contextlib.closing(self._connect()) as connection:
             self.note = self._set_journal(connection)
             connection.execute("BEGIN IMMEDIATE")
             if not self._is_ours(connection):

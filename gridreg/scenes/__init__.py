@@ -13,7 +13,7 @@ from gridreg.scenes.llff import ndc_rays
 from gridreg.scenes.load import default_protocol, load_scene
 from gridreg.scenes.prepare import Prepared, prepare
 from gridreg.scenes.protocols import PROTOCOLS, Protocol, get_protocol
-from gridreg.scenes.views import Scene, Views, backdrop, background_colour
+from gridreg.scenes.views import Scene, Views, background_colour
 
 __all__ = [
     "PROTOCOLS",
@@ -21,7 +21,6 @@ __all__ = [
     "Protocol",
     "Scene",
     "Views",
-    "backdrop",
     "background_colour",
     "builtin_depth",
     "builtin_mesh",

@@ -19,7 +19,7 @@ from gridreg.scenes.llff import read_llff
 from gridreg.scenes.protocols import Protocol, get_protocol
 from gridreg.scenes.reader import ViewReader
 from gridreg.scenes.transforms import read_transforms
-from gridreg.scenes.views import Scene, Views, backdrop, background_colour
+from gridreg.scenes.views import Scene, Views, background_colour
 
 __all__ = ["BUILTIN_MARKER", "NotASceneError", "default_protocol", "load_scene", "read_folder"]
 
@@ -82,8 +82,7 @@ def load_scene(
     validation_views = None if validation is None else reader.read(files.train, validation_ids)[0]
     extent = _extent(files, train)
     if background is None:
-        found = backdrop(train)
-        background = protocol.background if found is None else found
+        background = protocol.background if train.backdrop is None else train.backdrop
     scene = Scene(
         name=folder.resolve().name,
         protocol=protocol.name,

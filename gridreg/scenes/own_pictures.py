@@ -163,18 +163,16 @@ def _copy_mask(mask: Path, scene: Path, name: str) -> str:
     return place
 
 
-def shrink_pictures(frames: list[Frame], scene: Path, longest: int) -> tuple[int, int]:
-    """Reduce the pictures and masks of a scene in place, so that their longer edge is at most ``longest`` pixels.
+def shrink_pictures(frames: list[Frame], scene: Path, size: tuple[int, int], longest: int) -> tuple[int, int]:
+    """Reduce pictures and masks of ``size`` in place, so that their longer edge is at most ``longest`` pixels.
 
     Returns:
         Width and height of the pictures now.
     """
-    with Image.open(scene / frames[0].file_path) as first:
-        old: tuple[int, int] = first.size
-    share = longest / max(old)
+    share = longest / max(size)
     if share >= 1:
-        return old
-    new = max(1, round(old[0] * share)), max(1, round(old[1] * share))
+        return size
+    new = max(1, round(size[0] * share)), max(1, round(size[1] * share))
     for frame in frames:
         for name in (frame.file_path, frame.mask_path):
             if name is None:

@@ -187,7 +187,7 @@ def _write(
         )
     frames = [replace(frame, pose=pose) for frame, pose in zip(frames, poses, strict=True)]
     content = {EXTENT_KEY: {"near": extent.near, "far": extent.far, "bounds": extent.bounds.tolist()}}
-    reduced = shrink_pictures(frames, scene, longest_edge)
+    reduced = shrink_pictures(frames, scene, size, longest_edge)
     cameras = [_camera_keys(frame.camera, size, reduced) for frame in frames]
     shared = cameras[0] if all(camera == cameras[0] for camera in cameras) else {}
     listed = [

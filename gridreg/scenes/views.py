@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -10,7 +11,7 @@ from torch import Tensor
 
 from gridreg.errors import InputError
 
-__all__ = ["Scene", "Views", "backdrop", "background_colour"]
+__all__ = ["Scene", "Views", "background_colour"]
 
 # Share of a picture's edge that is looked at for a backdrop, and of its pixels that must have the colour up to a bound.
 _FRAME, _AGREEING, _CLOSE = 0.02, 0.9, 0.05
@@ -86,6 +87,29 @@ class Views:
         """Columns of every image."""
         return int(self.rgba.shape[2])
 
+    @functools.cached_property
+    def backdrop(self) -> Tensor | None:
+        """The one colour that opaque pictures have along their edges (a sheet of paper, a studio), ``(3,)``.
+
+        None where pictures are transparent, so that nobody needs to guess, and where they show a room.
+
+        Example:
+            >>> rgba = torch.ones(1, 50, 50, 4)
+            >>> rgba[:, 10:40, 10:40, :3] = 0.2
+            >>> views = Views(rgba, torch.eye(4)[None], torch.ones(1, 4), ("a",), (0,))
+            >>> views.backdrop.tolist()
+            [1.0, 1.0, 1.0]
+        """
+        if not len(self) or bool((self.rgba[..., 3] < 1).any()):
+            return None
+        edge = max(1, round(_FRAME * min(self.height, self.width)))
+        rgb = self.rgba[..., :3]
+        sides = rgb[:, :edge], rgb[:, -edge:], rgb[:, :, :edge], rgb[:, :, -edge:]
+        pixels = torch.cat([side.reshape(-1, 3) for side in sides])
+        colour = pixels.median(dim=0).values
+        agreeing = ((pixels - colour).abs().amax(dim=-1) < _CLOSE).float().mean()
+        return colour if float(agreeing) >= _AGREEING else None
+
     def composited(self, background: str | Sequence[float] | Tensor) -> Tensor:
         """Return the images over one background colour.
 
@@ -106,29 +130,6 @@ class Views:
         )
 
 
-def backdrop(views: Views) -> Tensor | None:
-    """The one colour that opaque pictures have along their edges (a sheet of paper, a studio), ``(3,)``.
-
-    None where pictures are transparent, so that nobody needs to guess, and where they show a room.
-
-    Example:
-        >>> rgba = torch.ones(1, 50, 50, 4)
-        >>> rgba[:, 10:40, 10:40, :3] = 0.2
-        >>> views = Views(rgba, torch.eye(4)[None], torch.ones(1, 4), ("a",), (0,))
-        >>> backdrop(views).tolist()
-        [1.0, 1.0, 1.0]
-    """
-    rgba = views.rgba
-    if not len(views) or bool((rgba[..., 3] < 1).any()):
-        return None
-    edge = max(1, round(_FRAME * min(views.height, views.width)))
-    sides = rgba[:, :edge], rgba[:, -edge:], rgba[:, :, :edge], rgba[:, :, -edge:]
-    pixels = torch.cat([side[..., :3].reshape(-1, 3) for side in sides])
-    colour = pixels.median(dim=0).values
-    agreeing = ((pixels - colour).abs().amax(dim=-1) < _CLOSE).float().mean()
-    return colour if float(agreeing) >= _AGREEING else None
-
-
 @dataclass(frozen=True)
 class Scene:
     """A scene under a protocol, ready for training.
@@ -141,7 +142,7 @@ class Scene:
         near: distance along a ray, world units, before which nothing is looked for.
         far: distance along a ray, world units, beyond which nothing is looked for.
         bounds: ``(2, 3)`` float32, lower and upper corner of the box that holds the scene, world units.
-        background: ``(3,)`` float32, the colour behind renders and targets; that of opaque pictures' `backdrop`.
+        background: ``(3,)`` float32, the colour behind renders and targets; that of opaque pictures' `Views.backdrop`.
         fingerprint: hash of what training sees: the training images' pixels, ids, size and cameras. It does
             not depend on which test or validation views were read, so a checkpoint can be scored on others.
         builtin: whether this is the built-in scene, which no published figure is about.

@@ -81,7 +81,7 @@ class Execution:
         trainer, settings = self.trainer, self.config.train
         began = saved = time.perf_counter()
         before = self.seconds.get("train", 0.0)
-        if trainer.on_backdrop:
+        if self.scene.train.backdrop is not None:
             colour = ", ".join(f"{c:.2f}" for c in self.scene.background.tolist())
             progress.message(
                 f"opaque pictures on one colour ({colour}): it is the background, never a random one"

@@ -14,7 +14,7 @@ import gridreg
 from gridreg.base import Regularizer
 from gridreg.errors import InputError
 from gridreg.rendering import March, OccupancyGrid, Rendered, render_rays
-from gridreg.scenes import Scene, backdrop
+from gridreg.scenes import Scene
 from gridreg.training import events
 from gridreg.training.rays import RayBank, warp_of
 from gridreg.training.settings import TrainSettings
@@ -50,8 +50,6 @@ class Trainer:
         self.field, self.scene, self.settings = field, scene, settings
         self.generator = torch.Generator().manual_seed(seed)
         self.handle = gridreg.apply(field, *composition, total_steps=settings.steps, seed=seed)
-        # Random backgrounds behind opaque pictures on one colour would be answered with walls of that colour.
-        self.on_backdrop = backdrop(scene.train) is not None
         self.warp = warp_of(scene)
         self.bank = RayBank(scene.train, self.warp)
         self.step = 0
@@ -112,7 +110,8 @@ class Trainer:
         jitter = torch.rand(len(rays), generator=self.generator)
         default = self.scene.background.to(rgba)
         background = None
-        if not self.on_backdrop:
+        # Behind opaque pictures on one colour, random ones would be answered with walls of that colour.
+        if self.scene.train.backdrop is None:
             background = self.handle.background(len(rays), self.generator, default)
         background = (default if background is None else background).expand(len(rays), 3)
         target = rgba[:, :3] * rgba[:, 3:] + (1 - rgba[:, 3:]) * background
