@@ -155,6 +155,10 @@ class TestArguments:
     def test_too_many_validation_views(self, scene: Path, wanted: int) -> None:
         refused(scene, rf"validation: found {wanted}, expected 1 to 10 views", validation=wanted)
 
+    def test_a_validation_protocol_without_frames_left(self, scene: Path) -> None:
+        with pytest.raises(InputError, match="first12-validation: found 10, expected 1 to 6 views outside"):
+            load_scene(scene, "first12-validation")
+
     def test_validation_on_training_views(self, scene: Path) -> None:
         refused(scene, r"validation: views \[3\] are training views", validation=[3, 9])
 

@@ -201,6 +201,17 @@ def test_no_test_views(scene: Path) -> None:
     assert loaded.test.composited("white").shape == (0, SIZE, SIZE, 3)
 
 
+def test_a_validation_protocol_scores_training_frames_that_are_not_trained_on(scene: Path) -> None:
+    plain, tuning = load_scene(scene, "builtin8"), load_scene(scene, "builtin8-validation")
+    assert tuning.protocol == "builtin8-validation"
+    assert tuning.train.ids == plain.train.ids and tuning.fingerprint == plain.fingerprint
+    assert tuning.test.ids == tuple(range(8, 18))
+    frames = load_scene(scene, "builtin8", validation=10).validation
+    assert frames is not None and torch.equal(tuning.test.rgba, frames.rgba)
+    # Asked for by index, they are the test frames.
+    assert load_scene(scene, "builtin8-validation", test=[1]).test.names == plain.test.names[1:2]
+
+
 def test_validation_views(scene: Path) -> None:
     assert load_scene(scene, "builtin8", validation=[9, 17]).validation.ids == (9, 17)
     assert load_scene(scene, "builtin8", validation=10).validation.ids == tuple(range(8, 18))

@@ -16,7 +16,7 @@ from gridreg.scenes.colmap import find_models, read_colmap
 from gridreg.scenes.extent import Extent, blender_extent, check_box, points_extent
 from gridreg.scenes.frames import SceneFiles
 from gridreg.scenes.llff import read_llff
-from gridreg.scenes.protocols import Protocol, get_protocol
+from gridreg.scenes.protocols import VALIDATION_VIEWS, Protocol, get_protocol
 from gridreg.scenes.reader import ViewReader
 from gridreg.scenes.transforms import read_transforms
 from gridreg.scenes.views import Scene, Views, background_colour
@@ -66,7 +66,13 @@ def load_scene(
     files = read_folder(folder)
     positions = np.stack([frame.pose[:3, 3] for frame in files.train])
     train_ids = _checked(protocol.train.select(positions), files, "train", f"protocol {protocol.name}")
-    if test is None and files.split_here:
+    scored = files.test
+    if test is None and protocol.validates:
+        scored, test_ids = (
+            files.train,
+            _free_ids(VALIDATION_VIEWS, train_ids, files, f"protocol {protocol.name}"),
+        )
+    elif test is None and files.split_here:
         # The held-out frames are the test views; a protocol's rule would thin them out a second time.
         test_ids = tuple(range(len(files.test)))
     elif test is None:
@@ -78,7 +84,7 @@ def load_scene(
 
     reader = ViewReader(files, protocol, size, opaque)
     train, fingerprint = reader.read(files.train, train_ids)
-    test_views, _ = reader.read(files.test, test_ids)
+    test_views, _ = reader.read(scored, test_ids)
     validation_views = None if validation is None else reader.read(files.train, validation_ids)[0]
     extent = _extent(files, train)
     if background is None:
@@ -166,17 +172,20 @@ def _validation_ids(
     if wanted is None:
         return ()
     if isinstance(wanted, int):
-        free = [i for i in range(len(files.train)) if i not in set(train_ids)]
-        if not 0 < wanted <= len(free):
-            raise InputError(
-                f"validation: found {wanted}, expected 1 to {len(free)} views outside the training views"
-            )
-        return tuple(free[(2 * k + 1) * len(free) // (2 * wanted)] for k in range(wanted))
+        return _free_ids(wanted, train_ids, files, "validation")
     ids = _checked(tuple(wanted), files, "train", "validation")
     shared = sorted(set(ids) & set(train_ids))
     if shared:
         raise InputError(f"validation: views {shared} are training views")
     return ids
+
+
+def _free_ids(wanted: int, train_ids: tuple[int, ...], files: SceneFiles, by: str) -> tuple[int, ...]:
+    """Training frames that are not trained on, evenly spread."""
+    free = [i for i in range(len(files.train)) if i not in set(train_ids)]
+    if not 0 < wanted <= len(free):
+        raise InputError(f"{by}: found {wanted}, expected 1 to {len(free)} views outside the training views")
+    return tuple(free[(2 * k + 1) * len(free) // (2 * wanted)] for k in range(wanted))
 
 
 def _bounds(bounds: Sequence[Sequence[float]] | Tensor | NDArray[np.float64]) -> Tensor:

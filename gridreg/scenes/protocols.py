@@ -6,7 +6,7 @@ Figures of different protocols are not comparable: published baselines scatter b
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from gridreg.errors import InputError
 
 __all__ = [
     "PROTOCOLS",
+    "VALIDATION_VIEWS",
     "Every",
     "First",
     "KMeans",
@@ -144,6 +145,8 @@ class Protocol:
         halve_at: images of this edge, in pixels, are halved by 2x2 area means of RGBA before compositing.
         background: ``"white"`` or ``"black"``.
         source: who uses it.
+        validates: the scored views are `VALIDATION_VIEWS` training frames, evenly spread over those that are not trained
+            on, instead of ``test``.
     """
 
     name: str
@@ -152,8 +155,13 @@ class Protocol:
     halve_at: int | None
     background: str
     source: str
+    validates: bool = False
 
 
+VALIDATION_VIEWS = 10
+"""How many views a ``-validation`` protocol scores."""
+
+_SUFFIX = "-validation"
 _DIETNERF = Listed((26, 86, 2, 55, 75, 93, 16, 73))
 _GAUSSIAN = Listed((2, 16, 26, 55, 73, 76, 86, 93))
 _EVERY_SIXTH = Listed((0, 6, 12, 18, 24, 30, 36, 42))
@@ -185,7 +193,8 @@ def get_protocol(name: str) -> Protocol:
     Besides :data:`PROTOCOLS`, ``views<N>`` stands for N training views by NumPy's seed-0 choice and
     ``first<N>`` for the first N, both with size, background and test views of ``dietnerf8``; ``spread<N>``
     for N evenly spread over the list and all test views, as stored (RegNeRF's 3, 6 and 9 views of LLFF
-    scenes).
+    scenes). Any of them followed by ``-validation``, such as ``dietnerf8-validation``, trains on the same views and
+    scores training frames outside them: for choosing settings without a look at the test views.
 
     Raises:
         InputError: for an unknown name.
@@ -195,11 +204,14 @@ def get_protocol(name: str) -> Protocol:
     """
     if name in PROTOCOLS:
         return PROTOCOLS[name]
+    if name.endswith(_SUFFIX) and not name.removesuffix(_SUFFIX).endswith(_SUFFIX):
+        return replace(get_protocol(name.removesuffix(_SUFFIX)), name=name, validates=True)
     counted = re.fullmatch(r"(views|first|spread)([1-9]\d{0,5})", name)
     if counted is None:
         known = ", ".join(PROTOCOLS)
         raise InputError(
-            f"protocol: found {name!r}, expected one of {known}, views<N>, first<N> or spread<N>"
+            f"protocol: found {name!r}, expected one of {known}, views<N>, first<N>, spread<N>, or one "
+            "of these with -validation"
         )
     count = int(counted[2])
     if counted[1] == "spread":
