@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from backbones.kernels import dots
 from backbones.kernels.bfloat16 import load_low, store_low
 from backbones.kernels.compiler import float32, inline, kernel, matrix, next_task, uint16
 from backbones.kernels.simd import LANES, load, one, store, wide
@@ -95,11 +96,13 @@ class Chain:
         x: ``(N, in)`` input.
         weights: of each layer, in the input's precision.
         hidden: of each layer but the last, its output by chunk, padded.
+        by_dots: whether `backbones.kernels.dots` multiplies; then there is one chunk.
     """
 
     x: Tensor
     weights: list[Tensor]
     hidden: list[list[Tensor]]
+    by_dots: bool = False
 
     @property
     def rows(self) -> int:
@@ -136,6 +139,9 @@ def chain_forward(
     Returns:
         ``(N, out)`` float32 and what the backward pass needs.
     """
+    widest = max(x.shape[1], *(weight.shape[0] for weight, _ in layers))
+    if x.dtype == torch.bfloat16 and offset is None and widest <= dots.WIDEST and dots.available():
+        return _dots_forward(x, layers)
     weights = [weight.to(x.dtype).contiguous() for weight, _ in layers]
     biases = [None if bias is None else bias.to(x.dtype) for _, bias in layers]
     hidden: list[list[Tensor]] = [[] for _ in layers[1:]]
@@ -157,6 +163,45 @@ def chain_forward(
     return out, Chain(x, weights, hidden)
 
 
+def _dots_forward(x: Tensor, layers: Sequence[tuple[Tensor, Tensor | None]]) -> tuple[Tensor, Chain]:
+    """`chain_forward` by `backbones.kernels.dots`."""
+    hidden: list[list[Tensor]] = []
+    value = x
+    for weight, bias in layers[:-1]:
+        found = dots.multiply(value, dots.pack(weight), bias=bias, relu=True)
+        hidden.append([found])
+        value = _cut(found, x.shape[0], weight.shape[0])
+    weight, bias = layers[-1]
+    out = dots.multiply(value, dots.pack(weight), bias=bias, dtype=torch.float32)
+    return _cut(out, x.shape[0], weight.shape[0]), Chain(x, [w for w, _ in layers], hidden, by_dots=True)
+
+
+def _cut(x: Tensor, rows: int, columns: int) -> Tensor:
+    """The first rows and columns, contiguous."""
+    return x[:rows, :columns].contiguous()
+
+
+def _dots_backward(
+    saved: Chain, gradient: Tensor, columns: int
+) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:
+    """`chain_backward` by `backbones.kernels.dots`."""
+    slope, of_layers = gradient.to(torch.bfloat16).contiguous(), []
+    for place in reversed(range(len(saved.weights))):
+        weight = saved.weights[place]
+        if place == 0:
+            of_layers.append(dots.weight_gradient(slope, saved.x))
+            break
+        (hidden,) = saved.hidden[place - 1]
+        of_layers.append(dots.weight_gradient(slope, _cut(hidden, saved.rows, weight.shape[1])))
+        found = dots.multiply(slope, dots.pack(weight.detach().t()), gates=hidden)
+        slope = _cut(found, saved.rows, weight.shape[1])
+    of_x = torch.empty(saved.rows, 0, dtype=torch.bfloat16)
+    if columns:
+        found = dots.multiply(slope, dots.pack(saved.weights[0].detach().t()[:columns]))
+        of_x = _cut(found, saved.rows, columns)
+    return of_x, of_layers[::-1]
+
+
 def chain_backward(
     saved: Chain, gradient: Tensor, columns: int, of_first: list[Tensor] | None = None
 ) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:
@@ -171,6 +216,8 @@ def chain_backward(
     Returns:
         Gradients of the input, ``(N, columns)`` in its precision, and of each layer's weight and bias, float32.
     """
+    if saved.by_dots:
+        return _dots_backward(saved, gradient, columns)
     depth, dtype = len(saved.weights), saved.x.dtype
     of_weights = [torch.zeros(weight.shape) for weight in saved.weights]
     of_biases = [torch.zeros(weight.shape[0]) for weight in saved.weights]

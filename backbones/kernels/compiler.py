@@ -33,7 +33,6 @@ from typing import Any
 import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
 from numba import cfunc, extending, njit, types
-from numba.core import cgutils
 from numba.core.caching import FunctionCache
 from numba.core.errors import NumbaWarning
 from numba.np import arrayobj
@@ -272,7 +271,9 @@ def scratch(context: Any, length: Any, dtype: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         count = signature.args[0].literal_value
         block = ir.ArrayType(context.get_data_type(kind.dtype), count)
-        memory = cgutils.alloca_once(builder, block)  # type: ignore[no-untyped-call]
+        # numba's own `alloca_once` also writes zeros, element by element: code of the length of the memory.
+        with builder.goto_entry_block():
+            memory = builder.alloca(block)
         return _wrap(context, builder, kind, memory, [context.get_constant(types.intp, count)])
 
     return kind(length, dtype), generate
