@@ -35,7 +35,8 @@ def test_products_and_their_endings(count, width, height):
     product = x.double() @ weight.double().T
     packed = pack(weight)
     full = multiply(x, packed, bias=bias, dtype=torch.float32)
-    assert full.is_contiguous() and full.shape[0] % 8 == full.shape[1] % 16 == 0
+    assert full.is_contiguous()
+    assert full.shape[0] % 8 == full.shape[1] % 16 == 0
     close(full[:count, :height], product + bias, product, 1e-5)
     close(multiply(x, packed)[:count, :height], product, product, 2**-8)
     hidden = multiply(x, packed, bias=bias, relu=True)
@@ -62,7 +63,8 @@ def test_sums_over_rows(count, width, height):
 def test_no_rows():
     assert multiply(draw(0, 5), pack(draw(3, 5).float()), dtype=torch.float32).shape == (0, 16)
     of_weight, of_bias = weight_gradient(draw(0, 3), draw(0, 5))
-    assert torch.equal(of_weight, torch.zeros(3, 5)) and torch.equal(of_bias, torch.zeros(3))
+    assert torch.equal(of_weight, torch.zeros(3, 5))
+    assert torch.equal(of_bias, torch.zeros(3))
 
 
 @native

@@ -204,10 +204,12 @@ def test_no_test_views(scene: Path) -> None:
 def test_a_validation_protocol_scores_training_frames_that_are_not_trained_on(scene: Path) -> None:
     plain, tuning = load_scene(scene, "builtin8"), load_scene(scene, "builtin8-validation")
     assert tuning.protocol == "builtin8-validation"
-    assert tuning.train.ids == plain.train.ids and tuning.fingerprint == plain.fingerprint
+    assert tuning.train.ids == plain.train.ids
+    assert tuning.fingerprint == plain.fingerprint
     assert tuning.test.ids == tuple(range(8, 18))
     frames = load_scene(scene, "builtin8", validation=10).validation
-    assert frames is not None and torch.equal(tuning.test.rgba, frames.rgba)
+    assert frames is not None
+    assert torch.equal(tuning.test.rgba, frames.rgba)
     # Asked for by index, they are the test frames.
     assert load_scene(scene, "builtin8-validation", test=[1]).test.names == plain.test.names[1:2]
 

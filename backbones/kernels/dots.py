@@ -74,7 +74,8 @@ _DOT, _CONVERT = "llvm.x86.avx512bf16.dpbf16ps.512", "llvm.x86.avx512bf16.cvtnep
 @functools.cache
 def available() -> bool:
     """Whether numba compiles for a processor that has these instructions."""
-    if config.CPU_NAME not in (None, "host") or config.CPU_FEATURES is not None:
+    told = config.CPU_NAME, config.CPU_FEATURES  # type: ignore[attr-defined]
+    if told[0] not in (None, "host") or told[1] is not None:
         return False
     try:
         return bool(binding.get_host_cpu_features().get("avx512bf16", False))
@@ -99,9 +100,9 @@ def _block(vectors: int, ending: str) -> Any:
 
     ``block(a, at, down, along, b, begin, pairs, c, to, row, d, n)``: for ``r < 8`` and ``j < 16 vectors`` the sum over
     ``p < pairs`` of ``a[at + r down + p along] . b[panel]`` ends in ``c[to + r row + j]``. Elements of a and b are pairs
-    of bfloat16, whatever their arrays hold, and places in them are counted in pairs; a panel of b has 16 columns. The
-    ending says what becomes of the sum: ``add`` to what stands in c; with d from ``n`` on, ``full``: d is added,
-    ``low``: that in bfloat16, ``relu``: its ReLU in bfloat16, ``gate``: 0 where d, at the place of c, is not positive.
+    of bfloat16, whatever their arrays hold; places in them are counted in pairs; a panel of b has 16 columns. What
+    becomes of the sum is the ending's: ``add``: added to what stands in c; with d from ``n`` on, ``full``: d is added;
+    ``low``: that in bfloat16; ``relu``: its ReLU in bfloat16; ``gate``: 0 where d, at the place of c, is not positive.
     """
 
     @intrinsic
@@ -148,7 +149,7 @@ def _block(vectors: int, ending: str) -> Any:
                 factors.append(builder.bitcast(words, _LOW))
             start = builder.add(at, builder.mul(number, along))
             undefined, everywhere = ir.Constant(_WORDS, ir.Undefined), ir.Constant(_WORDS, [0] * 16)
-            grown = []
+            grown: list[Any] = []
             for r in range(_HIGH):
                 pair = builder.load(builder.gep(left, [builder.add(start, builder.mul(down, _INDEX(r)))]))
                 pair = builder.insert_element(undefined, pair, _WORD(0))
@@ -348,7 +349,8 @@ def pack(weight: Tensor) -> Tensor:
     rows, columns = weight.shape
     low = weight.detach().to(torch.bfloat16)
     padded = F.pad(low, (0, columns % 2, 0, _up(rows, 16) - rows)).contiguous()
-    return padded.view(torch.int32).unflatten(0, (-1, 16)).transpose(1, 2).contiguous()
+    words = padded.view(torch.int32)
+    return words.reshape(-1, 16, words.shape[1]).transpose(1, 2).contiguous()
 
 
 def multiply(
@@ -367,8 +369,8 @@ def multiply(
         packed: the weight ``(N, K)``, see `pack`; N at most `WIDEST`.
         bias: ``(N,)`` float32.
         relu: of the result, which is then bfloat16.
-        gates: what this returned for a ReLU of M rows and N columns: the result, in bfloat16 and without bias, is 0 where
-            that is not positive.
+        gates: what this returned for a ReLU of M rows and N columns: the result, in bfloat16 and without bias, is 0
+            where that is not positive.
         dtype: of the result otherwise, float32 or bfloat16.
 
     Returns:

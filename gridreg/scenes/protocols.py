@@ -145,8 +145,8 @@ class Protocol:
         halve_at: images of this edge, in pixels, are halved by 2x2 area means of RGBA before compositing.
         background: ``"white"`` or ``"black"``.
         source: who uses it.
-        validates: the scored views are `VALIDATION_VIEWS` training frames, evenly spread over those that are not trained
-            on, instead of ``test``.
+        validates: the scored views are `VALIDATION_VIEWS` training frames, evenly spread over those that are not
+            trained on, instead of ``test``.
     """
 
     name: str
