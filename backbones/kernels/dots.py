@@ -99,10 +99,10 @@ def _block(vectors: int, ending: str) -> Any:
     """An intrinsic for a block of results, 8 rows and 16 columns for each of ``vectors``, that stays in registers.
 
     ``block(a, at, down, along, b, begin, pairs, c, to, row, d, n)``: for ``r < 8`` and ``j < 16 vectors`` the sum over
-    ``p < pairs`` of ``a[at + r down + p along] . b[panel]`` ends in ``c[to + r row + j]``. Elements of a and b are pairs
-    of bfloat16, whatever their arrays hold; places in them are counted in pairs; a panel of b has 16 columns. What
-    becomes of the sum is the ending's: ``add``: added to what stands in c; with d from ``n`` on, ``full``: d is added;
-    ``low``: that in bfloat16; ``relu``: its ReLU in bfloat16; ``gate``: 0 where d, at the place of c, is not positive.
+    ``p < pairs`` of ``a[at + r down + p along] . b[panel]`` ends in ``c[to + r row + j]``. Places in a and b are those
+    of pairs of bfloat16, whatever their arrays hold; a panel of b has 16 columns. What becomes of the sum is the
+    ending's: ``add``: added to what stands in c; with d from ``n`` on, ``full``: d is added; ``low``: that in bfloat16;
+    ``relu``: its ReLU in bfloat16; ``gate``: 0 where d, at the place of c, is not positive.
     """
 
     @intrinsic

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from gridreg.rendering import backends
 from gridreg.rendering.occupancy import OccupancyGrid
+from gridreg.rendering.pooling import pool_faint
 from gridreg.rendering.rays import Rays, box_intersection, camera_rays
 from gridreg.samples import RaySamples
 
@@ -54,6 +55,8 @@ class March:
         transmittance_bound: samples behind this transmittance are dropped, unitless; the colour of a pixel
             changes by at most this much. 0 keeps them all.
         weight_bound: colour is evaluated only where the weight exceeds this (TensoRF uses 1e-4).
+        pool_weight: neighbours on a ray that weigh less than this share the colour of one of them, see
+            `gridreg.rendering.pooling`; only where `render_rays` gets a generator. 0: every sample has its own.
     """
 
     step: float
@@ -61,6 +64,7 @@ class March:
     far: float = 1e10
     transmittance_bound: float = 1e-4
     weight_bound: float = 1e-4
+    pool_weight: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -164,6 +168,7 @@ def render_rays(
     jitter: Tensor | None = None,
     near_far: tuple[Tensor, Tensor] | None = None,
     hook: SampleHook | None = None,
+    generator: torch.Generator | None = None,
 ) -> Rendered:
     """Render a batch of rays, differentiably in the field's parameters.
 
@@ -176,6 +181,7 @@ def render_rays(
         jitter: ``(R,)`` in [0, 1), the share of a step by which each ray's samples are shifted; None: 0.5.
         near_far: ``(R,)`` each, instead of the march's near and far.
         hook: gets the samples before they are composited.
+        generator: for training: draws what the march's ``pool_weight`` leaves to chance.
     """
     if jitter is None:
         jitter = torch.full((len(rays),), 0.5, dtype=rays.origins.dtype, device=rays.origins.device)
@@ -200,7 +206,15 @@ def render_rays(
     )
     visible = samples.weights.detach() > march.weight_bound
     chosen = visible.nonzero().squeeze(-1)
-    seen_colours = _colours(field, marched, chosen, rays, samples.ray_indices[chosen])
+    ray_indices = samples.ray_indices[chosen]
+    if march.pool_weight > march.weight_bound and generator is not None:
+        speakers, pools = pool_faint(
+            samples.weights.detach()[chosen], ray_indices, march.pool_weight, generator
+        )
+        spoken = _colours(field, marched, chosen[speakers], rays, ray_indices[speakers])
+        seen_colours = spoken.index_select(0, pools)
+    else:
+        seen_colours = _colours(field, marched, chosen, rays, ray_indices)
     colours = torch.zeros_like(marched.positions).index_put((chosen,), seen_colours)
     samples = samples.replace(colours=colours, background=background.expand(len(rays), 3))
     if hook is not None:

@@ -77,6 +77,7 @@ class Trainer:
             far=far,
             transmittance_bound=self.settings.transmittance_bound,
             weight_bound=self.settings.weight_bound,
+            pool_weight=self.settings.pool_weight,
         )
 
     def _make_optimizer(self) -> torch.optim.Optimizer:
@@ -126,6 +127,7 @@ class Trainer:
             jitter=jitter,
             near_far=self.handle.near_far(march.near * ones, march.far * ones),
             hook=self.handle,
+            generator=self.generator,
         )
         return rendered, target
 

@@ -1,0 +1,61 @@
+"""One colour for several faint samples: most samples that a ray sees weigh next to nothing.
+
+In the fog of a young field, nine in ten of the samples whose colour counts weigh less than a hundredth each, and all of
+them together less than a quarter. Neighbours among them are pooled until they weigh a given amount, and one of them,
+drawn in proportion to its weight, lends its colour to the pool. The expected colour of a ray, and the expected gradient
+of every colour, are those of evaluating them all; the gradient of a weight sees the colour of its pool, in expectation
+the pool's mean, in place of the sample's own.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+__all__ = ["pool_faint"]
+
+
+@torch.no_grad()
+def pool_faint(
+    weights: Tensor, rays: Tensor, bound: float, generator: torch.Generator | None = None
+) -> tuple[Tensor, Tensor]:
+    """Pools of consecutive faint samples, and one speaker of each.
+
+    A pool holds samples of one ray that are lighter than ``bound``, with no heavier one between them; it weighs less
+    than twice ``bound``. A sample that weighs at least ``bound`` is alone in its pool.
+
+    Args:
+        weights: ``(K,)`` positive, packed by ray, in order along it.
+        rays: ``(K,)`` the ray of each.
+        bound: weight, unitless.
+        generator: draws the speakers, in proportion to weight; None: the one at half of the pool's weight.
+
+    Returns:
+        ``speakers (P,)`` int64, one index into the samples for every pool, increasing; and ``pools (K,)`` int64, the
+        pool of each sample, never decreasing.
+
+    Example:
+        >>> w, r = torch.tensor([0.5, 0.001, 0.004, 0.5]), torch.tensor([0, 0, 0, 1])
+        >>> [x.tolist() for x in pool_faint(w, r, 0.01)]
+        [[0, 2, 3], [0, 1, 1, 2]]
+    """
+    heavy = weights >= bound
+    # Sums over a whole batch: single precision would lose the faintest.
+    w = weights.double()
+    light = torch.where(heavy, 0.0, w)
+    bucket = ((light.cumsum(0) - light) / bound).floor()
+    first = torch.ones_like(heavy)
+    first[1:] = (rays[1:] != rays[:-1]) | (bucket[1:] != bucket[:-1]) | heavy[1:] | heavy[:-1]
+    pools = first.cumsum(0) - 1
+    starts = first.nonzero().squeeze(-1)
+    ends = torch.cat([starts[1:], starts.new_tensor([len(w)])])[: len(starts)]
+    running = w.cumsum(0)
+    before = (running - w)[starts]
+    share: Tensor | float = 0.5
+    if generator is not None:
+        share = torch.rand(len(starts), generator=generator, dtype=w.dtype, device=generator.device).to(
+            w.device
+        )
+    threshold = before + share * (running[ends - 1] - before)
+    speakers = torch.searchsorted(running, threshold, right=True)
+    return torch.minimum(torch.maximum(speakers, starts), ends - 1), pools

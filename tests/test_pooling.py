@@ -1,0 +1,133 @@
+"""Faint samples that share a colour: what is in a pool, and that nothing changes in expectation."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor, nn
+
+from gridreg.rendering import March, OccupancyGrid, Rays, render_rays
+from gridreg.rendering.pooling import pool_faint
+
+
+def seeded(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+@st.composite
+def packed(draw: st.DrawFn) -> tuple[Tensor, Tensor]:
+    """Weights of the samples of some rays, over five orders of magnitude, and the ray of each."""
+    lengths = draw(st.lists(st.integers(0, 12), max_size=8))
+    exponents = draw(st.lists(st.floats(-5, 0), min_size=sum(lengths), max_size=sum(lengths)))
+    weights = 10.0 ** torch.tensor(exponents, dtype=torch.float32)
+    return weights, torch.repeat_interleave(
+        torch.arange(len(lengths)), torch.tensor(lengths, dtype=torch.int64)
+    )
+
+
+@given(samples=packed(), bound=st.sampled_from([1e-3, 1e-2, 0.3]), seed=st.none() | st.integers(0, 99))
+def test_pools_are_runs_of_faint_neighbours_on_one_ray(samples, bound, seed):
+    weights, rays = samples
+    speakers, pools = pool_faint(weights, rays, bound, None if seed is None else seeded(seed))
+    assert pools.shape == weights.shape
+    # Every pool has its speaker among its members, and pools follow one another.
+    assert torch.equal(pools[speakers], torch.arange(len(speakers)))
+    assert torch.equal(pools.unique_consecutive(), torch.arange(len(speakers)))
+    for number in range(len(speakers)):
+        members = (pools == number).nonzero().squeeze(-1)
+        assert len(rays[members].unique()) == 1
+        if len(members) > 1:
+            assert bool((weights[members] < bound).all())
+            assert float(weights[members].double().sum()) < 2 * bound
+    # Two faint neighbours stay apart only where a pool is full.
+    assert len(speakers) <= len(weights)
+
+
+def test_no_samples():
+    speakers, pools = pool_faint(torch.empty(0), torch.empty(0, dtype=torch.int64), 0.1, seeded())
+    assert speakers.shape == pools.shape == (0,)
+
+
+def test_speakers_are_drawn_in_proportion_to_weight():
+    weights, rays = torch.tensor([1e-4, 3e-4, 6e-4]), torch.zeros(3, dtype=torch.int64)
+    generator, count = seeded(), torch.zeros(3)
+    for _ in range(4000):
+        speakers, _ = pool_faint(weights, rays, 1e-2, generator)
+        count[speakers] += 1
+    # Standard error of a share: below 0.008.
+    torch.testing.assert_close(count / 4000, torch.tensor([0.1, 0.3, 0.6]), atol=0.035, rtol=0)
+
+
+class Fog(nn.Module):
+    """Thin fog of changing colour."""
+
+    def __init__(self, density: float = 0.3) -> None:
+        super().__init__()
+        self.register_buffer("bounds", torch.tensor([[-1.0] * 3, [1.0] * 3]))
+        self.level = nn.Parameter(torch.tensor(density))
+        self.tint = nn.Parameter(torch.tensor([0.9, 0.5, 0.1]))
+        self.asked = 0
+
+    def density(self, x: Tensor) -> Tensor:
+        return self.level.expand(x.shape[0]) * (1.5 + torch.sin(5 * x[:, 2]))
+
+    def colour(self, x: Tensor, d: Tensor) -> Tensor:
+        self.asked += len(x)
+        return torch.sigmoid(self.tint + 2 * torch.sin(x[:, 2:] * torch.tensor([5.0, 7.0, 9.0])))
+
+
+def rays_down(count: int) -> Rays:
+    origins = torch.rand(count, 3, generator=seeded()) - 0.5
+    origins[:, 2] = 2.0
+    return Rays(origins, torch.tensor([0.0, 0.0, -1.0]).expand_as(origins).contiguous())
+
+
+def picture(field: Fog, pool: float, generator: torch.Generator | None) -> Tensor:
+    march = March(0.01, weight_bound=1e-4, transmittance_bound=0.0, pool_weight=pool)
+    grid = OccupancyGrid.full(field.bounds, (8, 8, 8))
+    return render_rays(
+        field, rays_down(16), grid, march, background=torch.ones(3), generator=generator
+    ).colour
+
+
+def test_the_mean_of_many_draws_is_the_picture_without_pools():
+    field = Fog()
+    exact = picture(field, 0.0, seeded()).detach()
+    generator = seeded()
+    draws = torch.stack([picture(field, 0.02, generator).detach() for _ in range(300)])
+    error = (draws.mean(0) - exact).abs()
+    assert float(draws.std(0).min()) > 0
+    assert bool((error < 5 * draws.std(0) / 300**0.5 + 1e-6).all())
+    # One draw differs by the spread of colours within pools of 2 %: half a percent of white here.
+    assert float((draws - exact).square().mean().sqrt()) < 0.005
+
+
+def test_the_mean_gradient_of_colours_is_the_one_without_pools():
+    field = Fog()
+
+    def gradient(pool: float, generator: torch.Generator) -> Tensor:
+        found = torch.autograd.grad(picture(field, pool, generator).square().sum(), field.tint)[0]
+        return found / 16
+
+    exact, generator = gradient(0.0, seeded()), seeded()
+    draws = torch.stack([gradient(0.02, generator) for _ in range(300)])
+    error = (draws.mean(0) - exact).abs()
+    assert bool((error < 5 * draws.std(0) / 300**0.5 + 1e-4).all())
+
+
+def test_fewer_colours_are_asked_for():
+    field = Fog()
+    picture(field, 0.0, seeded())
+    every, field.asked = field.asked, 0
+    picture(field, 0.02, seeded())
+    assert 0 < field.asked < every / 3
+
+
+@pytest.mark.parametrize("generator", [None, 0])
+def test_pictures_have_no_pools_without_a_generator_or_a_bound(generator):
+    field = Fog()
+    exact = picture(field, 0.0, None)
+    pool, draw = (0.02, None) if generator is None else (0.0, seeded())
+    assert torch.equal(picture(field, pool, draw), exact)
