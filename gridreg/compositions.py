@@ -11,7 +11,7 @@ from gridreg.errors import InputError
 from gridreg.grid_penalties import L1, Orthogonality, TotalVariation
 from gridreg.level_masks import ViewDependenceMask
 from gridreg.lowpass import FourierLowPass, SpatialAnnealing
-from gridreg.mask_regularizers import FrequencyMask
+from gridreg.mask_regularizers import FixedMask, FrequencyMask
 from gridreg.optimization import WeightDecay
 from gridreg.penalties import OcclusionLoss
 from gridreg.schedules import Linear, Piecewise
@@ -80,6 +80,13 @@ def _few_tensorf_printed() -> list[Regularizer]:
     return [replace(r, variant="printed") if isinstance(r, FrequencyMask) else r for r in _few_tensorf()]
 
 
+def _few_tensorf_fixed() -> list[Regularizer]:
+    """Few TensoRF as on human bodies: the first 0.8 of the channels are open throughout, the rest closed."""
+    return [
+        FixedMask(r.site, visible_ratio=0.8) if isinstance(r, FrequencyMask) else r for r in _few_tensorf()
+    ]
+
+
 def _few_tensorf_authors() -> list[Regularizer]:
     """Few TensoRF's program: blocks of 5, tail of 3, on planes and lines; no occlusion loss."""
     factors = [f"{grid}.{part}" for grid in _GRIDS for part in ("planes", "lines")]
@@ -129,6 +136,7 @@ register_composition("few_tensorf", _few_tensorf)
 # regularizers.
 register_composition("few_tensorf_finetuned", _few_tensorf)
 register_composition("few_tensorf_printed", _few_tensorf_printed)
+register_composition("few_tensorf_fixed", _few_tensorf_fixed)
 register_composition("few_tensorf_authors", _few_tensorf_authors)
 register_composition("freenerf", _freenerf)
 register_composition("fourierf", _fourierf)

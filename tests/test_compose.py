@@ -241,6 +241,13 @@ def test_the_printed_variant_differs_in_its_masks_alone() -> None:
     assert all(b == replace(a, variant="printed") for a, b in changed)
 
 
+def test_the_fixed_variant_keeps_the_same_share_open_on_the_same_sites() -> None:
+    few, fixed = gridreg.composition("few_tensorf"), gridreg.composition("few_tensorf_fixed")
+    changed = [(a, b) for a, b in zip(few, fixed, strict=True) if a != b]
+    assert [b for _, b in changed] == [gridreg.FixedMask(a.site, visible_ratio=0.8) for a, _ in changed]
+    assert len(changed) == 5
+
+
 def test_rivals_are_there() -> None:
     assert {"tensorf", "few_tensorf", "few_tensorf_finetuned", "freenerf", "fourierf", "sanerf"} <= set(
         gridreg.composition_names()

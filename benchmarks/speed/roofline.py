@@ -88,10 +88,11 @@ def counts_of(situation: Situation, turn: int = 0) -> Counts:
         raise InputError("roofline: found a decoder without layers, expected one of mlp, mlp_fea, mlp_pe")
     situation.rewind(turn)
     trainer.handle.step(situation.step)
-    samples = trainer.render_batch()[0].samples
+    rendered = trainer.render_batch()[0]
+    samples, coloured = rendered.samples, rendered.coloured
     assert samples is not None
     assert samples.positions is not None
-    coloured = samples.weights > trainer.settings.weight_bound
+    assert coloured is not None
     u = field.normalise(samples.positions)
     decoder = field.decoder
     encodings = [(decoder.features, decoder.feature_octaves), (3, decoder.direction_octaves)]
@@ -102,7 +103,7 @@ def counts_of(situation: Situation, turn: int = 0) -> Counts:
         steps=int(samples.steps.sum()),
         cells=trainer.occupancy.cells.numel(),
         samples=samples.t.numel(),
-        coloured=int(coloured.sum()),
+        coloured=coloured.numel(),
         density_channels=_open(field, "density"),
         appearance_channels=_open(field, "appearance"),
         density_nodes=touched_nodes(u, field.resolution),

@@ -56,10 +56,11 @@ class Situation:
         for turn in range(turns):
             self.rewind(turn)
             trainer.handle.step(self.step)
-            samples = trainer.render_batch()[0].samples
-            assert samples is not None
-            density += samples.t.numel()
-            colour += int((samples.weights > trainer.settings.weight_bound).sum())
+            rendered = trainer.render_batch()[0]
+            assert rendered.samples is not None
+            assert rendered.coloured is not None
+            density += rendered.samples.t.numel()
+            colour += rendered.coloured.numel()
         rays = turns * trainer.settings.rays
         return {
             "situation": self.name,

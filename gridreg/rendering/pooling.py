@@ -14,6 +14,9 @@ from torch import Tensor
 
 __all__ = ["pool_faint"]
 
+# Of weights as integers: fine enough for any that counts, and eight million samples of weight 1 still add up.
+_UNIT = 2.0**40
+
 
 @torch.no_grad()
 def pool_faint(
@@ -40,22 +43,25 @@ def pool_faint(
         [[0, 2, 3], [0, 1, 1, 2]]
     """
     heavy = weights >= bound
-    # Sums over a whole batch: single precision would lose the faintest.
-    w = weights.double()
-    light = torch.where(heavy, 0.0, w)
-    bucket = ((light.cumsum(0) - light) / bound).floor()
-    first = torch.ones_like(heavy)
-    first[1:] = (rays[1:] != rays[:-1]) | (bucket[1:] != bucket[:-1]) | heavy[1:] | heavy[:-1]
+    # Integers add up exactly, so that a ray's pools do not depend on the rays before it.
+    w = (weights.double() * _UNIT).long().clamp(min=1)
+    running = w.cumsum(0)
+    light = torch.where(heavy, 0, w)
+    passed = light.cumsum(0) - light
+    new_ray = torch.ones_like(heavy)
+    new_ray[1:] = rays[1:] != rays[:-1]
+    begun = passed[new_ray][new_ray.cumsum(0) - 1]
+    bucket = (passed - begun) // max(1, int(bound * _UNIT))
+    first = new_ray.clone()
+    first[1:] |= (bucket[1:] != bucket[:-1]) | heavy[1:] | heavy[:-1]
     pools = first.cumsum(0) - 1
     starts = first.nonzero().squeeze(-1)
     ends = torch.cat([starts[1:], starts.new_tensor([len(w)])])[: len(starts)]
-    running = w.cumsum(0)
     before = (running - w)[starts]
-    share: Tensor | float = 0.5
-    if generator is not None:
-        share = torch.rand(len(starts), generator=generator, dtype=w.dtype, device=generator.device).to(
-            w.device
-        )
-    threshold = before + share * (running[ends - 1] - before)
-    speakers = torch.searchsorted(running, threshold, right=True)
-    return torch.minimum(torch.maximum(speakers, starts), ends - 1), pools
+    total = running[ends - 1] - before
+    if generator is None:
+        share = total // 2
+    else:
+        drawn = torch.rand(len(starts), generator=generator, dtype=torch.float64, device=generator.device)
+        share = torch.minimum((drawn.to(w.device) * total).long(), total - 1)
+    return torch.searchsorted(running, before + share, right=True), pools

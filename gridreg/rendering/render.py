@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import torch
@@ -16,6 +16,9 @@ from gridreg.rendering.rays import Rays, box_intersection, camera_rays
 from gridreg.samples import RaySamples
 
 __all__ = ["Field", "March", "Marched", "Rendered", "SampleHook", "render_image", "render_rays"]
+
+
+_BLOCK = 1 << 16
 
 
 class Field(Protocol):
@@ -56,7 +59,7 @@ class March:
             changes by at most this much. 0 keeps them all.
         weight_bound: colour is evaluated only where the weight exceeds this (TensoRF uses 1e-4).
         pool_weight: neighbours on a ray that weigh less than this share the colour of one of them, see
-            `gridreg.rendering.pooling`; only where `render_rays` gets a generator. 0: every sample has its own.
+            `gridreg.rendering.pooling`. 0: every sample has its own.
     """
 
     step: float
@@ -76,12 +79,14 @@ class Rendered:
         opacity: ``(R,)`` in [0, 1].
         depth: ``(R,)`` weighted mean distance times opacity, world units (0 where nothing was hit).
         samples: the samples behind them; None for whole images.
+        coloured: ``(M,)`` int64, those of them whose colour was computed; None where that is not known.
     """
 
     colour: Tensor
     opacity: Tensor
     depth: Tensor
     samples: RaySamples | None = None
+    coloured: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -144,7 +149,10 @@ def _offsets_of(kept: Tensor, offsets: Tensor) -> Tensor:
 
 
 def _colours(field: Any, marched: Marched, chosen: Tensor, rays: Rays, ray_indices: Tensor) -> Tensor:
-    """Colours of some of the samples."""
+    """Colours of some of the samples; without gradients in blocks, which bounds the memory of a picture's fog."""
+    if not torch.is_grad_enabled() and len(chosen) > _BLOCK:
+        parts = zip(torch.split(chosen, _BLOCK), torch.split(ray_indices, _BLOCK), strict=True)
+        return torch.cat([_colours(field, marched, some, rays, of) for some, of in parts])
     if marched.features is not None:
         of_features = field.colour_of_features(
             marched.features.index_select(0, chosen), rays.directions, ray_indices
@@ -181,7 +189,8 @@ def render_rays(
         jitter: ``(R,)`` in [0, 1), the share of a step by which each ray's samples are shifted; None: 0.5.
         near_far: ``(R,)`` each, instead of the march's near and far.
         hook: gets the samples before they are composited.
-        generator: for training: draws what the march's ``pool_weight`` leaves to chance.
+        generator: for training: draws whose colour a pool has (the march's ``pool_weight``); None: that of the sample
+            at half of the pool's weight.
     """
     if jitter is None:
         jitter = torch.full((len(rays),), 0.5, dtype=rays.origins.dtype, device=rays.origins.device)
@@ -206,12 +215,13 @@ def render_rays(
     )
     visible = samples.weights.detach() > march.weight_bound
     chosen = visible.nonzero().squeeze(-1)
-    ray_indices = samples.ray_indices[chosen]
-    if march.pool_weight > march.weight_bound and generator is not None:
+    ray_indices, coloured = samples.ray_indices[chosen], chosen
+    if march.pool_weight > march.weight_bound:
         speakers, pools = pool_faint(
             samples.weights.detach()[chosen], ray_indices, march.pool_weight, generator
         )
-        spoken = _colours(field, marched, chosen[speakers], rays, ray_indices[speakers])
+        coloured = chosen[speakers]
+        spoken = _colours(field, marched, coloured, rays, ray_indices[speakers])
         seen_colours = spoken.index_select(0, pools)
     else:
         seen_colours = _colours(field, marched, chosen, rays, ray_indices)
@@ -219,7 +229,7 @@ def render_rays(
     samples = samples.replace(colours=colours, background=background.expand(len(rays), 3))
     if hook is not None:
         samples = hook.on_samples(samples)
-    return composite(samples)
+    return replace(composite(samples), coloured=coloured)
 
 
 def composite(samples: RaySamples) -> Rendered:

@@ -169,6 +169,7 @@ def load_run(folder: str | Path) -> LoadedRun:
         far=saved.state["march"]["far"],
         transmittance_bound=config.train.transmittance_bound,
         weight_bound=config.train.weight_bound,
+        pool_weight=config.train.pool_weight,
     )
     return LoadedRun(
         field,

@@ -33,8 +33,8 @@ class TrainSettings:
         carve: start from the visual hull of the training views' alpha.
         step_ratio: ray step in cells.
         weight_bound: colour is evaluated where the weight exceeds this.
-        pool_weight: while training, neighbours on a ray that weigh less than this share the colour of one of them,
-            drawn by weight (see `gridreg.rendering.March`); 0: every sample has its own.
+        pool_weight: neighbours on a ray that weigh less than this share the colour of one of them, in training drawn by
+            weight (see `gridreg.rendering.pooling`); 0: every sample has its own.
         transmittance_bound: samples behind this transmittance are dropped.
         checkpoint_minutes: between checkpoints.
         evaluate_at: iterations at which the validation views (or, without them, some test views) are scored on the way.

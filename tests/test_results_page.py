@@ -1,0 +1,77 @@
+"""The page of results is what the stored runs say, and its verdicts follow their rule."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+from gridreg.ablation.statistics import Estimate
+
+
+@pytest.fixture(scope="module")
+def results() -> ModuleType:
+    path = Path(__file__).parent.parent / "docs" / "make_results.py"
+    spec = importlib.util.spec_from_file_location("make_results", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["make_results"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def store(folder: Path, run: str, scene: str, seed: int, psnr: float, **more: Any) -> None:
+    """A run as `benchmarks/quality.py` leaves it, as far as the page reads it."""
+    record = {
+        "scene": scene, "protocol": "dietnerf8", "run": run, "changes": [], "seed": seed, "uses_alpha": False,
+        "mean": {"psnr": psnr, "ssim_gaussian": 0.9}, "seconds": {"train": 120.0}, "command": ["quality.py"], **more,
+    }  # fmt: skip
+    name = f"{scene}-{run.replace(':', '+')}-seed{seed}-{len(list(folder.iterdir()))}.json"
+    (folder / name).write_text(json.dumps(record))
+
+
+def test_the_page_is_up_to_date(results: ModuleType, capsys: pytest.CaptureFixture[str]) -> None:
+    assert results.main(["--check"]) == 0, capsys.readouterr().out
+
+
+def test_figures_are_means_over_seeds_of_whole_runs(results: ModuleType, tmp_path: Path) -> None:
+    store(tmp_path, "tensorf", "lego", 0, 24.0)
+    store(tmp_path, "tensorf", "lego", 1, 25.0)
+    # Shortened and changed runs are others.
+    store(tmp_path, "tensorf", "lego", 2, 10.0, command=["quality.py", "--steps", "9"])
+    store(tmp_path, "tensorf", "lego", 3, 10.0, changes=["train.rays=9"])
+    page = results.few_shot(results.Runs(tmp_path), "dietnerf8")
+    row = next(line for line in page.splitlines() if line.startswith("| TensoRF |"))
+    assert "| 24.50 ± 6.35 (2) | 23.83 | 0.900 | 2.0 | – |" in row
+
+
+def test_gains_are_paired(results: ModuleType, tmp_path: Path) -> None:
+    for seed, (few, plain) in enumerate([(26.0, 24.0), (27.0, 24.5)]):
+        store(tmp_path, "few_tensorf", "lego", seed, few)
+        store(tmp_path, "tensorf", "lego", seed, plain)
+    store(tmp_path, "tensorf", "chair", 0, 99.0)
+    found = results.Runs(tmp_path).gains(("lego", "chair"), "dietnerf8", "few_tensorf", "tensorf")
+    assert (found.mean, found.count) == (2.25, 2)
+    text = results.claims(results.Runs(tmp_path))
+    assert "| +3.05 | +2.25 [−0.93, +5.43] (2) | within noise |" in text
+
+
+@pytest.mark.parametrize(
+    ("found", "said"),
+    [
+        (None, "not measured"),
+        (Estimate(1.0, None, 1), "one pair: no verdict"),
+        (Estimate(1.0, 0.5, 3), "holds"),
+        (Estimate(0.8, 0.1, 3), "holds in sign, but is smaller"),
+        (Estimate(0.2, 0.5, 3), "within noise"),
+        (Estimate(-1.0, 0.5, 3), "the opposite"),
+    ],
+)
+def test_verdicts(results: ModuleType, found: Estimate | None, said: str) -> None:
+    assert results.verdict(found, 1.2) == said
