@@ -16,7 +16,7 @@ from pathlib import Path
 
 import torch
 
-from gridreg.errors import InputError
+from gridreg.cli import ending
 from gridreg.training import configure, execute, open_scene
 from gridreg.training.files import write_json
 from gridreg.training.options import TrainOptions
@@ -136,8 +136,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+    sys.exit(ending(main))

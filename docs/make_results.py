@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -18,7 +19,8 @@ from gridreg.ablation.statistics import Estimate, estimate
 from gridreg.ablation.tables import signed
 
 PAGE = Path(__file__).with_name("results.md")
-STORE = Path(__file__).parent.parent / "benchmarks" / "results" / "quality"
+STUDY_STORE = Path(__file__).parent.parent / "benchmarks" / "results"
+STORE = STUDY_STORE / "quality"
 
 HEAD = """# Results
 
@@ -165,6 +167,48 @@ def bodies(runs: Runs) -> str:
     return table(["method", *(f"{scene}: PSNR (seeds)" for scene in BODIES)], rows)
 
 
+STUDIES = (
+    (
+        "best_pieces",
+        "Pieces of `best`",
+        "One piece left out at a time: what a negative figure says is lost without it.",
+    ),
+    ("best_search", "Changes to `best`", "One change at a time; what did not help stayed out."),
+)
+
+
+def study_tables(folder: Path = STUDY_STORE) -> str:
+    """PSNR of the studies' rows on each scene, and their mean difference to the baseline."""
+    parts = []
+    for name, title, about in STUDIES:
+        found: dict[str, dict[tuple[str, int], dict[str, Any]]] = {}
+        for path in sorted((folder / name).glob("*.json")):
+            record = json.loads(path.read_text(encoding="utf-8"))
+            found.setdefault(record["label"], {})[record["scene"], record["seed"]] = record
+        if not found:
+            continue
+        first = next(iter(next(iter(found.values())).values()))
+        baseline, scenes = first["baseline"], sorted({scene for runs in found.values() for scene, _ in runs})
+        rows = []
+        for label, runs in found.items():
+            cells = [label]
+            for scene in scenes:
+                values = [psnr(record) for (where, _), record in runs.items() if where == scene]
+                cells.append(with_spread(estimate(values) if values else None))
+            pairs = runs.keys() & found.get(baseline, {}).keys()
+            gains = [psnr(runs[pair]) - psnr(found[baseline][pair]) for pair in sorted(pairs)]
+            gain = estimate(gains) if gains else None
+            least, most = (min(gains), max(gains)) if gains else (0.0, 0.0)
+            cells.append("" if label == baseline else "–" if gain is None else signed(gain.mean))
+            cells.append("" if label == baseline or gain is None else f"{signed(least)} to {signed(most)}")
+            rows.append((-math.inf if label == baseline else -gain.mean if gain else math.inf, cells))
+        head = ["row", *(f"{scene} (runs)" for scene in scenes), "mean difference (dB)", "least to most"]
+        where = f"`{first['protocol']}`, {first['steps']} iterations, `examples/studies/{name}.yaml`"
+        text = table(head, [cells for _, cells in sorted(rows, key=lambda row: row[0])])
+        parts.append(f"\n## {title}\n\n{about} {where}.\n\n{text}")
+    return "".join(parts)
+
+
 def verdict(found: Estimate | None, claimed: float) -> str:
     """What our pairs say about a claimed gain, dB; the rule stands on the page."""
     if found is None:
@@ -244,6 +288,7 @@ def page(runs: Runs) -> str:
         bodies(runs),
         "\n## Claims\n\n",
         claims(runs),
+        study_tables(),
     ]
     return "".join(parts)
 

@@ -75,3 +75,21 @@ def test_gains_are_paired(results: ModuleType, tmp_path: Path) -> None:
 )
 def test_verdicts(results: ModuleType, found: Estimate | None, said: str) -> None:
     assert results.verdict(found, 1.2) == said
+
+
+def test_studies_are_compared_with_their_baseline(results: ModuleType, tmp_path: Path) -> None:
+    folder = tmp_path / "best_search"
+    folder.mkdir()
+    more = {"baseline": "best", "protocol": "dietnerf8-validation", "steps": 1000}
+    for scene, level in (("lego", 27.0), ("chair", 29.0)):
+        store(folder, "best", scene, 0, level, label="best", **more)
+        store(folder, "worse", scene, 0, level - 0.5, label="worse", **more)
+    store(folder, "better", "lego", 0, 27.25, label="better", **more)
+    text = results.study_tables(tmp_path)
+    assert "## Changes to `best`" in text
+    rows = [line for line in text.splitlines() if line.startswith("| ")][2:]
+    assert rows == [
+        "| best | 29.00 (1) | 27.00 (1) |  |  |",
+        "| better | – | 27.25 (1) | +0.25 | +0.25 to +0.25 |",
+        "| worse | 28.50 (1) | 26.50 (1) | −0.50 | −0.50 to −0.50 |",
+    ]
