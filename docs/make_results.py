@@ -173,7 +173,16 @@ STUDIES = (
         "Pieces of `best`",
         "One piece left out at a time: what a negative figure says is lost without it.",
     ),
-    ("best_search", "Changes to `best`", "One change at a time; what did not help stayed out."),
+    (
+        "best_rates",
+        "Learning rates of `best`",
+        "As it was with TensoRF's rates and without distortion penalty; one run a row.",
+    ),
+    (
+        "best_search",
+        "Changes to `best`",
+        "As it was then, one change at a time; what did not help stayed out.",
+    ),
 )
 
 

@@ -38,8 +38,8 @@ ROWS = {
     "printed_mask": ["few_tensorf", "few_tensorf_printed", "few_tensorf_authors", "no masks"],
     "few_tensorf_pieces": ["neither", "masks alone", "occlusion loss alone", "both"],
     "best_pieces": [
-        "best", "no masks", "no occlusion loss", "no total variation", "no L1", "no random background", "no carving",
-        "grid to 200^3", "24 components", "no pools",
+        "best", "no masks", "no occlusion loss", "no distortion", "no total variation", "no L1",
+        "no random background", "no carving", "learning rates of TensoRF", "grid to 200^3", "24 components", "no pools",
     ],
     "best_search": [
         "best", "learning rate falls to a hundredth", "distortion 0.01", "learning rate of grids 0.04", "L1 five times",
