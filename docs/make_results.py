@@ -171,12 +171,13 @@ STUDIES = (
     (
         "best_pieces",
         "Pieces of `best`",
-        "One piece left out at a time: what a negative figure says is lost without it.",
+        "One piece left out at a time; what a negative figure says is lost without it.",
     ),
+    ("best_more", "More of `best`", "Without masks, as it is now; one weight changed at a time."),
     (
         "best_rates",
         "Learning rates of `best`",
-        "As it was with TensoRF's rates and without distortion penalty; one run a row.",
+        "As it was with masks and without distortion penalty; one run a row.",
     ),
     (
         "best_search",

@@ -38,9 +38,10 @@ ROWS = {
     "printed_mask": ["few_tensorf", "few_tensorf_printed", "few_tensorf_authors", "no masks"],
     "few_tensorf_pieces": ["neither", "masks alone", "occlusion loss alone", "both"],
     "best_pieces": [
-        "best", "no masks", "no occlusion loss", "no distortion", "no total variation", "no L1",
-        "no random background", "no carving", "learning rates of TensoRF", "grid to 200^3", "24 components", "no pools",
+        "all pieces and masks", "no masks", "no occlusion loss", "no L1", "no total variation", "no distortion",
+        "no random background",
     ],
+    "best_more": ["best", "total variation 0.008", "distortion 0.01"],
     "best_search": [
         "best", "learning rate falls to a hundredth", "distortion 0.01", "learning rate of grids 0.04", "L1 five times",
         "distortion 0.001", "no view dependence", "entropy of opacity", "learning rate constant", "initial opacity 0.5",
