@@ -17,6 +17,7 @@ from typing import Any
 
 from gridreg.ablation.statistics import Estimate, estimate
 from gridreg.ablation.tables import signed
+from gridreg.training.files import write_text
 
 PAGE = Path(__file__).with_name("results.md")
 STUDY_STORE = Path(__file__).parent.parent / "benchmarks" / "results"
@@ -70,22 +71,20 @@ BODY_METHODS = (
 
 
 class Runs:
-    """The stored runs, by scene, protocol, run, changes and seed; shortened runs are left out."""
+    """The stored runs, by scene, protocol, run and seed; shortened and changed runs are left out."""
 
     def __init__(self, folder: Path = STORE) -> None:
-        self.records: dict[tuple[str, str, str, tuple[str, ...]], dict[int, dict[str, Any]]] = {}
+        self.records: dict[tuple[str, str, str], dict[int, dict[str, Any]]] = {}
         for path in sorted(folder.glob("*.json")):
             record = json.loads(path.read_text(encoding="utf-8"))
-            if "--steps" in record["command"]:
+            if "--steps" in record["command"] or record["changes"]:
                 continue
-            key = (record["scene"], record["protocol"], record["run"], tuple(record["changes"]))
+            key = (record["scene"], record["protocol"], record["run"])
             self.records.setdefault(key, {})[record["seed"]] = record
 
-    def of(
-        self, scene: str, protocol: str, run: str, changes: Sequence[str] = ()
-    ) -> dict[int, dict[str, Any]]:
+    def of(self, scene: str, protocol: str, run: str) -> dict[int, dict[str, Any]]:
         """Records by seed."""
-        return self.records.get((scene, protocol, run, tuple(changes)), {})
+        return self.records.get((scene, protocol, run), {})
 
     def mean(
         self, scene: str, protocol: str, run: str, pick: Callable[[dict[str, Any]], float]
@@ -191,32 +190,41 @@ def study_tables(folder: Path = STUDY_STORE) -> str:
     """PSNR of the studies' rows on each scene, and their mean difference to the baseline."""
     parts = []
     for name, title, about in STUDIES:
-        found: dict[str, dict[tuple[str, int], dict[str, Any]]] = {}
-        for path in sorted((folder / name).glob("*.json")):
-            record = json.loads(path.read_text(encoding="utf-8"))
-            found.setdefault(record["label"], {})[record["scene"], record["seed"]] = record
-        if not found:
-            continue
-        first = next(iter(next(iter(found.values())).values()))
-        baseline, scenes = first["baseline"], sorted({scene for runs in found.values() for scene, _ in runs})
-        rows = []
-        for label, runs in found.items():
-            cells = [label]
-            for scene in scenes:
-                values = [psnr(record) for (where, _), record in runs.items() if where == scene]
-                cells.append(with_spread(estimate(values) if values else None))
-            pairs = runs.keys() & found.get(baseline, {}).keys()
-            gains = [psnr(runs[pair]) - psnr(found[baseline][pair]) for pair in sorted(pairs)]
-            gain = estimate(gains) if gains else None
-            least, most = (min(gains), max(gains)) if gains else (0.0, 0.0)
-            cells.append("" if label == baseline else "–" if gain is None else signed(gain.mean))
-            cells.append("" if label == baseline or gain is None else f"{signed(least)} to {signed(most)}")
-            rows.append((-math.inf if label == baseline else -gain.mean if gain else math.inf, cells))
-        head = ["row", *(f"{scene} (runs)" for scene in scenes), "mean difference (dB)", "least to most"]
-        where = f"`{first['protocol']}`, {first['steps']} iterations, `examples/studies/{name}.yaml`"
-        text = table(head, [cells for _, cells in sorted(rows, key=lambda row: row[0])])
-        parts.append(f"\n## {title}\n\n{about} {where}.\n\n{text}")
+        records = [
+            json.loads(path.read_text(encoding="utf-8")) for path in sorted((folder / name).glob("*.json"))
+        ]
+        if records:
+            first = records[0]
+            where = f"`{first['protocol']}`, {first['steps']} iterations, `examples/studies/{name}.yaml`"
+            parts.append(f"\n## {title}\n\n{about} {where}.\n\n{study_table(records)}")
     return "".join(parts)
+
+
+def study_table(records: Sequence[dict[str, Any]]) -> str:
+    """The rows of one study: the baseline, then the others from the best difference to the worst."""
+    found: dict[str, dict[tuple[str, int], float]] = {}
+    for record in records:
+        found.setdefault(record["label"], {})[record["scene"], record["seed"]] = psnr(record)
+    scenes = sorted({record["scene"] for record in records})
+
+    def cells(runs: dict[tuple[str, int], float]) -> list[str]:
+        by_scene = ([value for (where, _), value in runs.items() if where == scene] for scene in scenes)
+        return [with_spread(estimate(values) if values else None) for values in by_scene]
+
+    base = found.pop(records[0]["baseline"], {})
+    compared = []
+    for label, runs in found.items():
+        gains = [runs[pair] - base[pair] for pair in sorted(runs.keys() & base.keys())]
+        if gains:
+            mean = estimate(gains).mean
+            told = [signed(mean), f"{signed(min(gains))} to {signed(max(gains))}"]
+        else:
+            mean, told = -math.inf, ["–", ""]
+        compared.append((mean, [label, *cells(runs), *told]))
+    compared.sort(key=lambda row: -row[0])
+    head = ["row", *(f"{scene} (runs)" for scene in scenes), "mean difference (dB)", "least to most"]
+    first = [[records[0]["baseline"], *cells(base), "", ""]] if base else []
+    return table(head, [*first, *(row for _, row in compared)])
 
 
 def verdict(found: Estimate | None, claimed: float) -> str:
@@ -315,7 +323,7 @@ def main(words: Sequence[str] | None = None) -> int:
         fresh = PAGE.is_file() and PAGE.read_text(encoding="utf-8") == text
         print(f"{PAGE.name}: {'up to date' if fresh else 'stale; run python docs/make_results.py'}")
         return 0 if fresh else 1
-    PAGE.write_text(text, encoding="utf-8")
+    write_text(PAGE, text)
     return 0
 
 

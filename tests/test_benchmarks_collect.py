@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import sys
 from pathlib import Path
@@ -14,17 +13,12 @@ import pytest
 from gridreg.ablation import Store
 from gridreg.errors import InputError
 from tests import ablation_results
+from tests.programs import ROOT, module_at
 
 
 @pytest.fixture
 def collect() -> ModuleType:
-    path = Path(__file__).parent.parent / "benchmarks" / "collect.py"
-    spec = importlib.util.spec_from_file_location("collect", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return module_at(ROOT / "benchmarks" / "collect.py")
 
 
 class _Store:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -11,17 +10,12 @@ import pytest
 
 import gridreg
 from gridreg.base import REGISTRY, Regularizer
+from tests.programs import ROOT, module_at
 
 
 @pytest.fixture(scope="module")
 def catalogue() -> ModuleType:
-    path = Path(__file__).parent.parent / "docs" / "make_catalogue.py"
-    spec = importlib.util.spec_from_file_location("make_catalogue", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return module_at(ROOT / "docs" / "make_catalogue.py")
 
 
 def own_classes() -> list[type[Regularizer]]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import importlib.util
 import re
 import sys
 from collections.abc import Iterator
@@ -12,6 +11,8 @@ from types import ModuleType
 from xml.etree import ElementTree
 
 import pytest
+
+from tests.programs import module_at
 
 DOCS = Path(__file__).parent.parent / "docs"
 
@@ -76,15 +77,6 @@ def test_pages_show_every_picture_with_a_description() -> None:
 
 
 # --- the site's own code
-
-
-def module_at(path: Path) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def test_results_enter_the_menu_once_they_are_there(tmp_path: Path) -> None:

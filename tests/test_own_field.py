@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import inspect
 import sys
 from collections.abc import Iterator
@@ -14,20 +13,14 @@ import pytest
 import torch
 
 import gridreg
+from tests.programs import ROOT, module_at
 
-PATH = Path(__file__).parents[1] / "examples" / "own_field.py"
+PATH = ROOT / "examples" / "own_field.py"
 
 
 @pytest.fixture(scope="module")
 def example() -> Iterator[ModuleType]:
-    spec = importlib.util.spec_from_file_location("own_field", PATH)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    # `inspect` finds the source of a class by its module's name.
-    sys.modules["own_field"] = module
-    spec.loader.exec_module(module)
-    yield module
+    yield module_at(PATH)
     del sys.modules["own_field"]
 
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
-import sys
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -12,18 +10,12 @@ from typing import Any
 import pytest
 
 from gridreg.ablation.statistics import Estimate
+from tests.programs import ROOT, module_at
 
 
 @pytest.fixture(scope="module")
 def results() -> ModuleType:
-    path = Path(__file__).parent.parent / "docs" / "make_results.py"
-    spec = importlib.util.spec_from_file_location("make_results", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["make_results"] = module
-    spec.loader.exec_module(module)
-    return module
+    return module_at(ROOT / "docs" / "make_results.py")
 
 
 def store(folder: Path, run: str, scene: str, seed: int, psnr: float, **more: Any) -> None:

@@ -74,8 +74,8 @@ _DOT, _CONVERT = "llvm.x86.avx512bf16.dpbf16ps.512", "llvm.x86.avx512bf16.cvtnep
 @functools.cache
 def available() -> bool:
     """Whether numba compiles for a processor that has these instructions."""
-    told = config.CPU_NAME, config.CPU_FEATURES  # type: ignore[attr-defined]
-    if told[0] not in (None, "host") or told[1] is not None:
+    name, features = config.CPU_NAME, config.CPU_FEATURES  # type: ignore[attr-defined]
+    if name not in (None, "host") or features is not None:
         return False
     try:
         return bool(binding.get_host_cpu_features().get("avx512bf16", False))
@@ -161,14 +161,15 @@ def _block(vectors: int, ending: str) -> Any:
                 value.add_incoming(larger, body)
             builder.branch(head)
             builder.position_at_end(end)
+            added = []
             if ending in ("full", "low", "relu"):
                 added = [
                     builder.load(_vector(builder, more, builder.add(n, _INDEX(16 * v)), _REALS), align=4)
                     for v in range(vectors)
                 ]
-            for number_, (place, value) in enumerate(zip(places, sums, strict=True)):
-                if ending in ("full", "low", "relu"):
-                    value = builder.fadd(value, added[number_ % vectors])
+            for nth, (place, value) in enumerate(zip(places, sums, strict=True)):
+                if added:
+                    value = builder.fadd(value, added[nth % vectors])
                 if ending == "relu":
                     # Not-a-number stays.
                     value = builder.select(builder.fcmp_ordered("<=", value, nothing), nothing, value)

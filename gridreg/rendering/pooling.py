@@ -1,8 +1,7 @@
 """One colour for several faint samples: most samples that a ray sees weigh next to nothing.
 
-In the fog of a young field, nine in ten of the samples whose colour counts weigh less than a hundredth each, and all of
-them together less than a quarter. Neighbours among them are pooled until they weigh a given amount, and one of them,
-drawn in proportion to its weight, lends its colour to the pool. The expected colour of a ray, and the expected gradient
+Neighbours among them are pooled until they weigh a given amount, and one of them, drawn in proportion to its weight,
+lends its colour to the pool. The expected colour of a ray, and the expected gradient
 of every colour, are those of evaluating them all; the gradient of a weight sees the colour of its pool, in expectation
 the pool's mean, in place of the sample's own.
 """

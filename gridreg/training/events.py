@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from gridreg.errors import InputError
-from gridreg.rendering import OccupancyGrid, visual_hull
+from gridreg.rendering import March, OccupancyGrid, visual_hull
 from gridreg.training.rays import meets
 
 if TYPE_CHECKING:
@@ -21,6 +21,7 @@ __all__ = [
     "carved_box",
     "cell_size",
     "filter_rays",
+    "march_of",
     "occupancy_resolution",
     "resample",
     "resolution_of",
@@ -35,6 +36,18 @@ def cell_size(field: Any) -> float:
     resolution = getattr(field, "resolution", None)
     nodes = torch.tensor(resolution if resolution is not None else (129, 129, 129))
     return float(((field.bounds[1] - field.bounds[0]).cpu() / (nodes - 1)).mean())
+
+
+def march_of(field: Any, settings: TrainSettings, near: float, far: float) -> March:
+    """How rays are walked at a field's present resolution, between two distances, world units."""
+    return March(
+        step=settings.step_ratio * cell_size(field),
+        near=near,
+        far=far,
+        transmittance_bound=settings.transmittance_bound,
+        weight_bound=settings.weight_bound,
+        pool_weight=settings.pool_weight,
+    )
 
 
 def occupancy_resolution(field: Any, settings: TrainSettings) -> tuple[int, int, int]:

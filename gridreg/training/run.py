@@ -163,14 +163,7 @@ def load_run(folder: str | Path) -> LoadedRun:
     handle.load_state_dict(state["handle"])
     handle.step(min(int(state["step"]), config.train.steps))
     field.eval()
-    march = March(
-        step=config.train.step_ratio * events.cell_size(field),
-        near=saved.state["march"]["near"],
-        far=saved.state["march"]["far"],
-        transmittance_bound=config.train.transmittance_bound,
-        weight_bound=config.train.weight_bound,
-        pool_weight=config.train.pool_weight,
-    )
+    march = events.march_of(field, config.train, saved.state["march"]["near"], saved.state["march"]["far"])
     return LoadedRun(
         field,
         OccupancyGrid(**state["occupancy"]),

@@ -70,15 +70,7 @@ class Trainer:
     @property
     def march(self) -> March:
         """How rays are walked at the field's present resolution."""
-        near, far = self.scene.near, self.scene.far
-        return March(
-            step=self.settings.step_ratio * events.cell_size(self.field),
-            near=near,
-            far=far,
-            transmittance_bound=self.settings.transmittance_bound,
-            weight_bound=self.settings.weight_bound,
-            pool_weight=self.settings.pool_weight,
-        )
+        return events.march_of(self.field, self.settings, self.scene.near, self.scene.far)
 
     def _make_optimizer(self) -> torch.optim.Optimizer:
         rates = {"grid": self.settings.learning_rate_grid, "network": self.settings.learning_rate_network}
