@@ -99,13 +99,15 @@ class TotalVariation(Regularizer):
     Args:
         site: its `grids` are penalised.
         weight: factor of the loss; TensoRF: 0.1 to 1.0 (times 0.02), on CP lines 1e-3 (times 2).
+        every: acts in every so many iterations, from the first on, and then so many times as strongly: the mean over
+            iterations stays, and large grids are read less often.
 
     Formula: ``sum over grids and spatial axes of mean((g[i + 1] - g[i])^2)``
     Unit: squared unit of the grid
     Source: TensoRF (Chen et al. 2022), total variation loss
 
     Raises:
-        InputError: the site or the weight is not one; a grid has no spatial axes.
+        InputError: the site, the weight or ``every`` is not one; a grid has no spatial axes.
 
     Example:
         >>> TotalVariation("density", weight=0.01).weight
@@ -114,26 +116,36 @@ class TotalVariation(Regularizer):
 
     site: SiteLike
     weight: Numeric = 0.01
+    every: int = 1
 
     def __post_init__(self) -> None:
         """Refuse at once what can be refused before the first step."""
         check_site(self.site)
         check_weight(self.weight)
+        if isinstance(self.every, bool) or not isinstance(self.every, int) or self.every < 1:
+            raise InputError(f"TotalVariation: found every={self.every!r}, expected an integer of at least 1")
 
     def grid_penalty(self, grids: Sequence[Grid], context: Context) -> Tensor:
-        """`total_variation`, added over the grids."""
-        return torch.stack([total_variation(g.values, _spatial(g, "TotalVariation")) for g in grids]).sum()
+        """`total_variation`, added over the grids, times ``every``; 0 in the iterations between."""
+        axes = [_spatial(g, "TotalVariation") for g in grids]
+        if context.step % self.every:
+            return grids[0].values.new_zeros(())
+        parts = [total_variation(g.values, spatial) for g, spatial in zip(grids, axes, strict=True)]
+        return torch.stack(parts).sum() * self.every
 
     def local_terms(self, grids: Sequence[Grid], context: Context) -> list[LocalTerm]:
-        """One for each grid, if all channels take part."""
-        if any(grid.selected is not None for grid in grids):
+        """One for each grid, if all channels take part; none in the iterations between."""
+        if context.step % self.every or any(grid.selected is not None for grid in grids):
             return []
-        return [LocalTerm("total_variation", 1.0, g.parameter, _spatial(g, "TotalVariation")) for g in grids]
+        return [
+            LocalTerm("total_variation", self.every, g.parameter, _spatial(g, "TotalVariation"))
+            for g in grids
+        ]
 
     @classmethod
     def examples(cls, site: SiteLike) -> list[Regularizer]:
-        """With a number and with a schedule."""
-        return [cls(site), cls(site, weight=Linear(0.0, 1.0))]
+        """With a number, with a schedule, and not in every iteration."""
+        return [cls(site), cls(site, weight=Linear(0.0, 1.0)), cls(site, every=3)]
 
 
 @register

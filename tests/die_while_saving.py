@@ -14,6 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import safetensors.torch
 import torch
 
 from gridreg.training.checkpoint import load_checkpoint, save_checkpoint
@@ -22,6 +23,7 @@ FOLDER = Path(sys.argv[1]) / "checkpoint"
 OPERATIONS = [
     (os, ("rename", "replace", "fsync", "unlink", "rmdir")),
     (Path, ("mkdir", "write_bytes")),
+    (safetensors.torch, ("save_file",)),
 ]
 DEAD = 9
 
@@ -49,12 +51,15 @@ def save_and_die(operation: int, step: int) -> None:
             if left < 0:
                 if function is write_bytes:
                     function(arguments[0], arguments[1][: len(arguments[1]) // 2])
+                if function is save_file:
+                    function(*arguments)
+                    os.truncate(arguments[1], os.path.getsize(arguments[1]) // 2)
                 os._exit(DEAD)
             return function(*arguments, **options)
 
         return wrapper
 
-    write_bytes = Path.write_bytes
+    write_bytes, save_file = Path.write_bytes, safetensors.torch.save_file
     for owner, names in OPERATIONS:
         for name in names:
             setattr(owner, name, dying(getattr(owner, name)))

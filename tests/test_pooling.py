@@ -7,7 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
-from gridreg.rendering import March, OccupancyGrid, Rays, render, render_rays
+import backbones.kernels  # noqa: F401  (registers the compiled pools)
+from gridreg.rendering import March, OccupancyGrid, Rays, backends, render, render_rays
 from gridreg.rendering.pooling import pool_faint
 
 
@@ -42,6 +43,43 @@ def test_pools_are_runs_of_faint_neighbours_on_one_ray(samples, bound, seed):
             assert float(weights[members].double().sum()) < 2 * bound
     # Two faint neighbours stay apart only where a pool is full.
     assert len(speakers) <= len(weights)
+
+
+@given(
+    samples=packed(),
+    bounds=st.sampled_from([(1e-4, 0.0), (1e-4, 1e-3), (1e-3, 1e-2), (0.0, 0.3), (1e-2, 1e-2)]),
+    seed=st.none() | st.integers(0, 99),
+)
+def test_compiled_pools_are_the_plain_ones(samples, bounds, seed):
+    weights, rays = samples
+    offsets = torch.zeros(10, dtype=torch.int64)
+    offsets[1:] = torch.bincount(rays, minlength=9).cumsum(0)
+    found = []
+    for name in ("compiled", "torch"):
+        with backends.use_backend(name):
+            found.append(backends.pool(weights, offsets, *bounds, None if seed is None else seeded(seed)))
+    for compiled, plain in zip(*found, strict=True):
+        assert torch.equal(compiled, plain)
+    speakers, of_rays, pools = found[0]
+    assert torch.equal(of_rays, rays[speakers])
+    assert torch.equal(pools >= 0, weights > bounds[0])
+
+
+@given(samples=packed(), floor=st.sampled_from([1e-4, 1e-2, 2.0]), channels=st.integers(1, 4))
+def test_colours_of_pools_and_their_gradients(samples, floor, channels):
+    weights, rays = samples
+    offsets = torch.zeros(9, dtype=torch.int64)
+    offsets[1:] = torch.bincount(rays, minlength=8).cumsum(0)
+    speakers, _, pools = backends.pool(weights, offsets, floor, 0.1)
+    colours = torch.rand(len(speakers), channels, generator=seeded()).requires_grad_()
+    upstream = torch.rand(len(weights), channels, generator=seeded(1))
+    found = []
+    for name in ("compiled", "torch"):
+        with backends.use_backend(name):
+            out = backends.spread(colours, pools, speakers)
+            found.append((out.detach(), *torch.autograd.grad(out, colours, upstream)))
+    torch.testing.assert_close(found[0][0], found[1][0], rtol=0, atol=0)
+    torch.testing.assert_close(found[0][1], found[1][1])
 
 
 def test_no_samples():

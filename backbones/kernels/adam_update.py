@@ -19,7 +19,7 @@ __all__ = ["update"]
 # Elements worked on at a time: all that one piece reads and writes stays in the first-level cache.
 _PIECE = 1024
 # Blocks of slabs that may be updated at the same time; fixed, so that sums do not depend on threads.
-_BLOCKS = 24
+_BLOCKS = 16
 # Elements of a task where no term looks at neighbours.
 _FLAT = 1 << 15
 _ZERO, _ONE = np.float32(0), np.float32(1)

@@ -21,6 +21,7 @@ from backbones.kernels.compiler import (
     vector,
 )
 from backbones.kernels.march import march
+from backbones.kernels.pools import pool, spread
 from backbones.kernels.threading import launch
 from gridreg.rendering.backends import Backend, register_backend
 
@@ -202,4 +203,4 @@ def terminate(optical_depth: Tensor, offsets: Tensor, bound: float) -> Tensor:
 
 def register() -> None:
     """Make the compiled march and compositing available to `gridreg.rendering.backends`."""
-    register_backend("compiled", Backend(march, composite_weights, accumulate, terminate))
+    register_backend("compiled", Backend(march, composite_weights, accumulate, terminate, pool, spread))

@@ -3,6 +3,8 @@ space."""
 
 from __future__ import annotations
 
+import threading
+import weakref
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -37,6 +39,7 @@ _ZERO_F, _ONE_F = np.float32(0), np.float32(1)
 _INFINITE = np.float32(np.inf)
 # Rays of one task.
 _RAYS = 32
+_kept = threading.local()
 
 
 @kernel
@@ -218,6 +221,20 @@ class Marked(NamedTuple):
     offsets: Tensor
 
 
+def _coarse(cells: Tensor, grid: Tensor) -> Tensor:
+    """Which blocks of cells hold an occupied one; kept for the thread's next march through the same cells."""
+    version = None if cells.is_inference() else cells._version
+    of, seen, coarse = getattr(_kept, "blocks", (None, None, None))
+    if coarse is not None and version is not None and of() is cells and seen == version:
+        return coarse  # type: ignore[no-any-return]
+    coarse = torch.empty(*(-(-n // int(_COARSE)) for n in grid.shape), dtype=torch.uint8)
+    launch(
+        _coarsen, coarse.shape[0], grid, coarse, torch.empty(len(coarse), grid.shape[2], dtype=torch.uint8)
+    )
+    _kept.blocks = weakref.ref(cells), version, coarse
+    return coarse
+
+
 @torch.no_grad()
 def mark(
     origins: Tensor,
@@ -237,12 +254,10 @@ def mark(
     grid = cells.contiguous().view(torch.uint8)
     shape = torch.tensor(grid.shape)
     box = torch.stack([bounds[0], shape.to(bounds.dtype) / (bounds[1] - bounds[0])])
-    coarse = torch.empty(*(-(-n // int(_COARSE)) for n in grid.shape), dtype=torch.uint8)
-    columns = torch.empty(coarse.shape[0], grid.shape[2], dtype=torch.uint8)
+    coarse = _coarse(cells, grid)
     bits, counts = torch.zeros(rays, -(-steps // 64), dtype=torch.int64), torch.zeros(rays, dtype=torch.int64)
     tasks = -(-rays // _RAYS)
 
-    launch(_coarsen, coarse.shape[0] if steps else 0, grid, coarse, columns)
     launch(_mark, tasks if steps else 0, o, d, near, far, shift, step, grid, coarse, box, bits, counts)
     offsets = torch.zeros(rays + 1, dtype=torch.int64)
     torch.cumsum(counts, 0, out=offsets[1:])

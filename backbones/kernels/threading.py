@@ -33,6 +33,8 @@ __all__ = ["launch", "runtime"]
 _Team = Callable[[int, int, int], None]
 _NATIVE = ctypes.CFUNCTYPE(None, ctypes.c_void_p)
 _state: dict[str, Any] = {"forked": False}
+# Behind the shape of a tensor of 0, 1, 2 and 3 axes.
+_ONES = ((1, 1, 1), (1, 1), (1,), ())
 
 
 def _openmp_team() -> _Team | None:
@@ -116,17 +118,23 @@ def launch(kernel: Kernel, tasks: int, *arguments: Tensor | int | float, alone: 
 
 def pack(tasks: int, arguments: tuple[Tensor | int | float, ...]) -> Any:
     """The table that a kernel reads: next task, number of tasks, then four words for each argument."""
-    words = [0, tasks]
+    # One call that packs, instead of one conversion for each word: this is on the way of every kernel.
+    words: list[int | float] = [0, tasks]
+    form = ["qq"]
     for place, value in enumerate(arguments):
         if isinstance(value, Tensor):
-            if not value.is_contiguous() or value.device.type != "cpu" or value.dim() > 3:
+            shape = value.shape
+            if not value.is_contiguous() or value.device.type != "cpu" or len(shape) > 3:
                 raise ValueError(
                     f"argument {place}: found {value.device} tensor {tuple(value.shape)} with strides "
                     f"{value.stride()}, expected a contiguous CPU tensor of at most 3 axes"
                 )
-            words += (value.data_ptr(), *value.shape, *(1,) * (3 - value.dim()))
+            words += (value.data_ptr(), *shape, *_ONES[len(shape)])
+            form.append("qqqq")
         elif isinstance(value, float):
-            words += (*struct.unpack("q", struct.pack("d", value)), 0, 0, 0)
+            words += (value, 0, 0, 0)
+            form.append("dqqq")
         else:
             words += (int(value), 0, 0, 0)
-    return (ctypes.c_int64 * len(words))(*words)
+            form.append("qqqq")
+    return (ctypes.c_int64 * len(words)).from_buffer_copy(struct.pack("".join(form), *words))

@@ -22,8 +22,10 @@ __all__ = [
     "chosen_backend",
     "composite_weights",
     "march",
+    "pool",
     "register_backend",
     "registered_backends",
+    "spread",
     "takes_compiled",
     "terminate",
     "use_backend",
@@ -40,9 +42,13 @@ class Backend:
     composite_weights: Callable[[Tensor, Tensor], Tensor]
     accumulate: Callable[[Tensor, Tensor, Tensor], Tensor]
     terminate: Callable[[Tensor, Tensor, float], Tensor]
+    pool: Callable[[Tensor, Tensor, float, float, torch.Generator | None], tuple[Tensor, Tensor, Tensor]]
+    spread: Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
-_TORCH = Backend(plain.march, plain.composite_weights, plain.accumulate, plain.terminate)
+_TORCH = Backend(
+    plain.march, plain.composite_weights, plain.accumulate, plain.terminate, plain.pool, plain.spread
+)
 _BACKENDS: dict[str, Backend] = {"torch": _TORCH}
 _CHOICES = ("auto", "compiled", "torch")
 _choice = "auto"
@@ -236,3 +242,52 @@ def terminate(optical_depth: Tensor, offsets: Tensor, bound: float) -> Tensor:
     """
     plain.check_packed(optical_depth, offsets, "optical_depth")
     return _backend(optical_depth).terminate(optical_depth, offsets, bound)
+
+
+def pool(
+    weights: Tensor,
+    offsets: Tensor,
+    floor: float,
+    bound: float,
+    generator: torch.Generator | None = None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Samples whose colour is evaluated, and those that share it: see `gridreg.rendering.pooling`.
+
+    Args:
+        weights: ``(N,)``.
+        offsets: ``(R + 1,)`` int64.
+        floor: samples that do not weigh more have no colour.
+        bound: lighter neighbours are pooled until they weigh this much; not above ``floor``: no pools.
+        generator: draws the speakers, in proportion to weight; None: the one at half of the pool's weight.
+
+    Returns:
+        ``speakers (P,)`` int64, one sample of every pool, increasing; ``rays (P,)`` int64, theirs; ``pools (N,)`` int64,
+        the pool of each sample, -1 for none. Not differentiable.
+
+    Raises:
+        InputError: if ``offsets`` does not end at N.
+
+    Example:
+        >>> weights = torch.tensor([0.5, 0.001, 0.0, 0.004, 0.5])
+        >>> [x.tolist() for x in pool(weights, torch.tensor([0, 4, 5]), 1e-4, 0.01)]
+        [[0, 3, 4], [0, 0, 1], [0, 1, -1, 1, 2]]
+    """
+    plain.check_packed(weights, offsets, "weights")
+    return _backend(weights).pool(weights, offsets, floor, bound, generator)
+
+
+def spread(colours: Tensor, pools: Tensor, speakers: Tensor) -> Tensor:
+    """Colours of samples from those of their pools; 0 for a sample in none.
+
+    Args:
+        colours: ``(P, C)`` of the speakers.
+        pools, speakers: from `pool`.
+
+    Returns:
+        ``(N, C)``, differentiable once.
+
+    Example:
+        >>> spread(torch.tensor([[0.5], [1.0]]), torch.tensor([0, -1, 1, 1]), torch.tensor([0, 2])).tolist()
+        [[0.5], [0.0], [1.0], [1.0]]
+    """
+    return _backend(colours).spread(colours, pools, speakers)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from gridreg.errors import InputError
+from gridreg.rendering.pooling import pool_faint
 
 __all__ = [
     "CELL_TOLERANCE",
@@ -178,3 +179,24 @@ def accumulate(weights: Tensor, values: Tensor, offsets: Tensor) -> Tensor:
 def terminate(optical_depth: Tensor, offsets: Tensor, bound: float) -> Tensor:
     """See `gridreg.rendering.backends.terminate`."""
     return torch.exp(-_depth_before(optical_depth, offsets)) >= bound
+
+
+@torch.no_grad()
+def pool(
+    weights: Tensor, offsets: Tensor, floor: float, bound: float, generator: torch.Generator | None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """See `gridreg.rendering.backends.pool`."""
+    chosen = (weights > floor).nonzero().squeeze(-1)
+    rays = _ray_of_sample(offsets, weights.numel())[chosen]
+    speakers = members = torch.arange(len(chosen), device=chosen.device)
+    if bound > floor:
+        speakers, members = pool_faint(weights[chosen], rays, bound, generator)
+    pools = torch.full_like(weights, -1, dtype=torch.int64)
+    pools[chosen] = members
+    return chosen[speakers], rays[speakers], pools
+
+
+def spread(colours: Tensor, pools: Tensor, speakers: Tensor) -> Tensor:
+    """See `gridreg.rendering.backends.spread`."""
+    # The last row is that of samples in no pool.
+    return torch.cat([colours, colours.new_zeros(1, colours.shape[1])])[pools]

@@ -11,10 +11,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-__all__ = ["pool_faint"]
+__all__ = ["UNIT", "pool_faint"]
 
 # Of weights as integers: fine enough for any that counts, and eight million samples of weight 1 still add up.
-_UNIT = 2.0**40
+UNIT = 2.0**40
 
 
 @torch.no_grad()
@@ -43,14 +43,14 @@ def pool_faint(
     """
     heavy = weights >= bound
     # Integers add up exactly, so that a ray's pools do not depend on the rays before it.
-    w = (weights.double() * _UNIT).long().clamp(min=1)
+    w = (weights.double() * UNIT).long().clamp(min=1)
     running = w.cumsum(0)
     light = torch.where(heavy, 0, w)
     passed = light.cumsum(0) - light
     new_ray = torch.ones_like(heavy)
     new_ray[1:] = rays[1:] != rays[:-1]
     begun = passed[new_ray][new_ray.cumsum(0) - 1]
-    bucket = (passed - begun) // max(1, int(bound * _UNIT))
+    bucket = (passed - begun) // max(1, int(bound * UNIT))
     first = new_ray.clone()
     first[1:] |= (bucket[1:] != bucket[:-1]) | heavy[1:] | heavy[:-1]
     pools = first.cumsum(0) - 1

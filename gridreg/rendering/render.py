@@ -11,7 +11,6 @@ from torch import Tensor
 
 from gridreg.rendering import backends
 from gridreg.rendering.occupancy import OccupancyGrid
-from gridreg.rendering.pooling import pool_faint
 from gridreg.rendering.rays import Rays, box_intersection, camera_rays
 from gridreg.samples import RaySamples
 
@@ -213,19 +212,11 @@ def render_rays(
         ray_start=t_min,
         ray_steps=ray_steps,
     )
-    visible = samples.weights.detach() > march.weight_bound
-    chosen = visible.nonzero().squeeze(-1)
-    ray_indices, coloured = samples.ray_indices[chosen], chosen
-    if march.pool_weight > march.weight_bound:
-        speakers, pools = pool_faint(
-            samples.weights.detach()[chosen], ray_indices, march.pool_weight, generator
-        )
-        coloured = chosen[speakers]
-        spoken = _colours(field, marched, coloured, rays, ray_indices[speakers])
-        seen_colours = spoken.index_select(0, pools)
-    else:
-        seen_colours = _colours(field, marched, chosen, rays, ray_indices)
-    colours = torch.zeros_like(marched.positions).index_put((chosen,), seen_colours)
+    coloured, of_rays, pools = backends.pool(
+        samples.weights.detach(), samples.offsets, march.weight_bound, march.pool_weight, generator
+    )
+    spoken = _colours(field, marched, coloured, rays, of_rays)
+    colours = backends.spread(spoken, pools, coloured)
     samples = samples.replace(colours=colours, background=background.expand(len(rays), 3))
     if hook is not None:
         samples = hook.on_samples(samples)

@@ -22,6 +22,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,9 +30,10 @@ from typing import Any
 
 import safetensors.torch
 from safetensors import SafetensorError
+from torch import Tensor
 
 from gridreg.errors import InputError
-from gridreg.training.files import output_errors, remove_folder, write_bytes, write_json
+from gridreg.training.files import output_errors, remove_folder, write_json, writing
 from gridreg.training.state_tree import flatten_state, unflatten_state
 
 __all__ = ["FORMAT_VERSION", "Checkpoint", "has_checkpoint", "load_checkpoint", "save_checkpoint"]
@@ -80,21 +82,20 @@ def save_checkpoint(
     """
     folder, new, old = _names(folder)
     tensors, tree = flatten_state(state)
-    data = safetensors.torch.save(tensors)
-    content = {
-        "format": _FORMAT,
-        "version": FORMAT_VERSION,
-        "fingerprint": fingerprint,
-        "config": flatten_state(config)[1],
-        "state": tree,
-        "tensors": {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()},
-    }
+    plain = flatten_state(config)[1]
     with output_errors(folder):
         _refuse_foreign(folder)
         _settle(folder, new, old)
         try:
             new.mkdir()
-            write_bytes(new / _TENSORS, data)
+            content = {
+                "format": _FORMAT,
+                "version": FORMAT_VERSION,
+                "fingerprint": fingerprint,
+                "config": plain,
+                "state": tree,
+                "tensors": _write_tensors(new / _TENSORS, tensors),
+            }
             write_json(new / _STATE, {**content, "sha256": _digest(content)}, sort_keys=False)
         except BaseException:
             remove_folder(new)
@@ -103,6 +104,21 @@ def save_checkpoint(
             os.rename(folder, old)
         os.rename(new, folder)
         remove_folder(old)
+
+
+def _write_tensors(path: Path, tensors: dict[str, Tensor]) -> dict[str, Any]:
+    """Write a file of tensors from where they lie; returns its size and checksum."""
+    with writing(path) as temporary:
+        try:
+            safetensors.torch.save_file(tensors, temporary)
+        except SafetensorError as error:
+            number = re.search(r"os error (\d+)", str(error))
+            raise OSError(int(number[1]) if number else 0, str(error)) from error
+        with temporary.open("rb") as file:
+            digest = hashlib.sha256()
+            while block := file.read(1 << 20):
+                digest.update(block)
+            return {"bytes": file.tell(), "sha256": digest.hexdigest()}
 
 
 def load_checkpoint(folder: str | os.PathLike[str], *, fingerprint: str | None = None) -> Checkpoint:

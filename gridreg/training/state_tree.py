@@ -22,8 +22,8 @@ __all__ = ["flatten_state", "unflatten_state"]
 def flatten_state(state: Any) -> tuple[dict[str, Tensor], Any]:
     """Split nested state into tensors and a JSON-able tree.
 
-    Tensors are copied to the CPU, contiguous, each with memory of its own, so the result does not change when
-    training goes on. Python and NumPy numbers, text, ``None``, dicts with text or integer keys, lists,
+    Tensors are detached, on the CPU and contiguous; those that are so already share their memory with the state, so
+    use the result before training goes on. Python and NumPy numbers, text, ``None``, dicts with text or integer keys, lists,
     tuples and NumPy arrays are kept; NumPy scalars become Python numbers.
 
     Args:
@@ -101,8 +101,12 @@ def _store(tensor: Tensor, path: str, tensors: dict[str, Tensor]) -> str:
     # Different paths may read the same once joined by dots.
     while name in tensors:
         name, number = f"{path}~{number}", number + 1
-    copy = torch.empty(tensor.shape, dtype=tensor.dtype)
-    tensors[name] = copy.copy_(tensor.detach())
+    plain = tensor.detach().cpu().contiguous()
+    # One memory for two names, or a part of a larger one, is not what a file of tensors holds.
+    shared = plain.untyped_storage().nbytes() != plain.nbytes or any(
+        plain.data_ptr() == other.data_ptr() for other in tensors.values() if other.numel()
+    )
+    tensors[name] = plain.clone() if shared else plain
     return name
 
 
