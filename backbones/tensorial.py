@@ -238,9 +238,12 @@ class TensorialField(nn.Module):
         """
         return FusedAdam(groups, betas=betas)
 
-    def gradient_context(self) -> AbstractContextManager[None]:
-        """Around a trainer's backward pass: gradients of planes are added to buffers that stay."""
-        return kernels.accumulate_into_grad()
+    def gradient_context(self, faint: float = 0.0) -> AbstractContextManager[None]:
+        """Around a trainer's backward pass: gradients of planes are added to buffers that stay.
+
+        ``faint``: see `backbones.kernels.accumulate_into_grad`.
+        """
+        return kernels.accumulate_into_grad(faint)
 
     def sites(self) -> dict[str, Site]:
         """The encodings of the decoder; subclasses add their grids."""

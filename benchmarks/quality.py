@@ -16,6 +16,9 @@ from pathlib import Path
 
 import torch
 
+sys.path.insert(0, str(Path(__file__).parent))
+from speed.whole_run import Spans
+
 from gridreg.cli import ending
 from gridreg.training import configure, execute, open_scene
 from gridreg.training.files import write_json
@@ -57,10 +60,13 @@ def score(
     )
     config = configure(options)
     scene = open_scene(config, cache=Path(tempfile.gettempdir()))
+    spans = Spans(config.train)
     with tempfile.TemporaryDirectory() as out:
-        _, metrics = execute(config, scene, out)
+        _, metrics = execute(config, scene, out, watch=spans)
     if metrics is None:
         raise KeyboardInterrupt
+    # Peak memory is that of the process, which may have done other runs before.
+    metrics["spans"] = spans.rows
     metrics["config"] = {**metrics["config"], "scene": folder.name}
     RESULTS.mkdir(parents=True, exist_ok=True)
     metrics["run"] = run

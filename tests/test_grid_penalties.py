@@ -70,6 +70,24 @@ class TestTotalVariation:
         values = torch.randn(2, 3, 4, dtype=torch.float64, requires_grad=True)
         assert gradcheck(lambda x: total_variation(x, (1, 2)), (values,))
 
+    def test_every_third_iteration_three_times_as_strongly(self) -> None:
+        grids = [grid(4, 5, 2, dim=2, spatial=(0, 1)), grid(5, 2, dim=1, spatial=(0,), seed=1)]
+        always, rarely = TotalVariation("density"), TotalVariation("density", every=3)
+        once = always.grid_penalty(grids, CONTEXT)
+        for step, factor in enumerate([3, 0, 0, 3, 0, 0]):
+            context = Context(Clock(100, seed=0))
+            context.clock.step = step
+            torch.testing.assert_close(rarely.grid_penalty(grids, context), factor * once)
+            terms = rarely.local_terms(grids, context)
+            assert [term.scale for term in terms] == ([3, 3] if factor else [])
+
+    @pytest.mark.parametrize("every", [0, -1, 1.5, True])
+    def test_iterations_are_counted_from_one(self, every: Any) -> None:
+        with pytest.raises(
+            InputError, match=r"TotalVariation: found every=.*, expected an integer of at lea"
+        ):
+            TotalVariation("density", every=every)
+
     def test_a_grid_without_neighbours_is_an_error(self) -> None:
         with pytest.raises(InputError, match=r"TotalVariation: grid0 of shape \(4, 1\) has no spatial axis"):
             TotalVariation("density").grid_penalty([grid(4, 1, dim=0, spatial=(1,))], CONTEXT)

@@ -14,6 +14,7 @@ from backbones.kernels import cp, vm, vm_gradient
 from backbones.kernels.activation import Activation, March
 from backbones.kernels.march import march as _march
 from backbones.kernels.simd import LANES
+from backbones.kernels.sums import thin
 from backbones.kernels.walk import walk
 
 __all__ = ["accumulate_into_grad", "cp_density", "cp_features", "march_density", "vm_density", "vm_features"]
@@ -22,12 +23,17 @@ _local = threading.local()
 
 
 @contextmanager
-def accumulate_into_grad() -> Iterator[None]:
+def accumulate_into_grad(faint: float = 0.0) -> Iterator[None]:
     """Let compiled backward passes add to the ``.grad`` of planes in place, instead of handing out a new tensor.
 
     For training loops that keep their gradient buffers: a 300^3 grid has 70 MB of them, and to allocate, fill and
     add as much again in every iteration costs more than the gradient itself. It holds for backward passes that this
     thread starts, and for planes that are leaves; hooks of such planes are not called.
+
+    Args:
+        faint: gradients of marched densities below this share of their mean size are rounded at random, to 0 or to the
+            share, so that their expectation stays: see `backbones.kernels.sums.thin`. What is 0 is not added to the
+            grids, and most samples lie where hardly anything is. 0: all of them count.
 
     Example:
         >>> grids = [torch.ones(2, 2, 4, requires_grad=True) for _ in range(3)], [torch.ones(2, 4)] * 3
@@ -36,12 +42,12 @@ def accumulate_into_grad() -> Iterator[None]:
         >>> float(grids[0][0].grad.sum())
         4.0
     """
-    previous = getattr(_local, "in_place", False)
-    _local.in_place = True
+    previous = getattr(_local, "in_place", False), getattr(_local, "faint", 0.0)
+    _local.in_place, _local.faint = True, faint
     try:
         yield
     finally:
-        _local.in_place = previous
+        _local.in_place, _local.faint = previous
 
 
 def _gradient_buffers(planes: Sequence[Tensor], in_place: bool) -> tuple[list[Tensor], list[Tensor | None]]:
@@ -132,7 +138,8 @@ class _Activated(torch.autograd.Function):
     def backward(ctx: Any, upstream: Tensor) -> tuple[Any, ...]:
         density, u, *grids = ctx.saved_tensors
         # The derivative of softplus is 1 - exp(-softplus), and 0 where the density is 0: outside the box.
-        upstream = upstream * torch.expm1(density / -ctx.scale).mul_(-ctx.scale)
+        upstream = torch.expm1(density / -ctx.scale).mul_(upstream).mul_(-ctx.scale)
+        upstream = thin(upstream, getattr(_local, "faint", 0.0))
         return (None, None, None, None, None, *_gradients(ctx, u, grids, upstream))
 
 

@@ -198,7 +198,7 @@ def _dots_backward(
     of_x = torch.empty(saved.rows, 0, dtype=torch.bfloat16)
     if columns:
         found = dots.multiply(slope, dots.pack(saved.weights[0].detach().t()[:columns]))
-        of_x = _cut(found, saved.rows, columns)
+        of_x = found
     return of_x, of_layers[::-1]
 
 
@@ -214,7 +214,8 @@ def chain_backward(
         of_first: if given, the gradient of the first layer's output is appended, by chunk.
 
     Returns:
-        Gradients of the input, ``(N, columns)`` in its precision, and of each layer's weight and bias, float32.
+        Gradients of the input, ``(N, columns)`` in its precision, perhaps with more rows and columns, and of each
+        layer's weight and bias, float32.
     """
     if saved.by_dots:
         return _dots_backward(saved, gradient, columns)

@@ -33,6 +33,7 @@ from backbones.kernels.compiler import (
     vector,
 )
 from backbones.kernels.simd import LANES, load, one, store, wide
+from backbones.kernels.sums import fold
 from backbones.kernels.threading import launch
 
 __all__ = ["WIDEST", "available", "multiply", "pack", "weight_gradient"]
@@ -401,4 +402,4 @@ def weight_gradient(slope: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
     out = torch.empty(_TASKS, _up(slope.shape[1], 16), _up(x.shape[1], 16))
     totals = torch.empty(_TASKS, slope.shape[1])
     launch(_sum_rows, _TASKS, slope, x, out, totals)
-    return out.sum(0)[: slope.shape[1], : x.shape[1]], totals.sum(0)
+    return fold(out)[: slope.shape[1], : x.shape[1]], fold(totals)

@@ -99,6 +99,7 @@ class _MLP(Function):
         of_x, of_layers = chain_backward(
             ctx.saved, gradient, ctx.saved.x.shape[1] if wanted[3] else 0, slopes
         )
+        of_x = of_x[: ctx.saved.rows, : ctx.saved.x.shape[1]]
         of_offset: Tensor | None = None
         if slopes is not None:
             of_offset = torch.cat([torch.empty(0, ctx.saved.weights[0].shape[0]), *slopes]).float()

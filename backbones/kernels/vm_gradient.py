@@ -26,6 +26,7 @@ from backbones.kernels.lookup import ahead, bilinear, corners, linear, prefetch_
 from backbones.kernels.places import axes
 from backbones.kernels.rows import ALONE, ENTRY, TASKS, list_by_row, span
 from backbones.kernels.simd import LANES, load, one, store, wide
+from backbones.kernels.sums import fold
 from backbones.kernels.threading import launch
 from backbones.kernels.workspace import room
 
@@ -183,7 +184,7 @@ def _run(
         waste,
         alone=u.shape[0] < ALONE,
     )
-    return list(torch.split(copies.sum(0), nodes))
+    return list(torch.split(fold(copies), nodes))
 
 
 def density_backward(

@@ -261,8 +261,8 @@ def pool(
         generator: draws the speakers, in proportion to weight; None: the one at half of the pool's weight.
 
     Returns:
-        ``speakers (P,)`` int64, one sample of every pool, increasing; ``rays (P,)`` int64, theirs; ``pools (N,)`` int64,
-        the pool of each sample, -1 for none. Not differentiable.
+        ``speakers (P,)`` int64, one sample of every pool, increasing; ``rays (P,)`` int64, theirs; ``pools (N,)``
+        int64, the pool of each sample, -1 for none. Not differentiable.
 
     Raises:
         InputError: if ``offsets`` does not end at N.

@@ -35,6 +35,8 @@ class TrainSettings:
         weight_bound: colour is evaluated where the weight exceeds this.
         pool_weight: neighbours on a ray that weigh less than this share the colour of one of them, in training drawn by
             weight (see `gridreg.rendering.pooling`); 0: every sample has its own.
+        faint_gradient: gradients of densities below this share of their mean size are rounded at random, to 0 or to the
+            share, so that their expectation stays; a field that does not offer it has all of them. 0: none.
         transmittance_bound: samples behind this transmittance are dropped.
         checkpoint_minutes: between checkpoints.
         evaluate_at: iterations at which the validation views (or, without them, some test views) are scored on the way.
@@ -59,6 +61,7 @@ class TrainSettings:
     step_ratio: float = 0.5
     weight_bound: float = 1e-4
     pool_weight: float = 0.0
+    faint_gradient: float = 0.0
     transmittance_bound: float = 1e-4
     checkpoint_minutes: float = 2.0
     evaluate_at: tuple[int, ...] = ()

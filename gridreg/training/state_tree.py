@@ -23,8 +23,8 @@ def flatten_state(state: Any) -> tuple[dict[str, Tensor], Any]:
     """Split nested state into tensors and a JSON-able tree.
 
     Tensors are detached, on the CPU and contiguous; those that are so already share their memory with the state, so
-    use the result before training goes on. Python and NumPy numbers, text, ``None``, dicts with text or integer keys, lists,
-    tuples and NumPy arrays are kept; NumPy scalars become Python numbers.
+    use the result before training goes on. Python and NumPy numbers, text, ``None``, dicts with text or integer
+    keys, lists, tuples and NumPy arrays are kept; NumPy scalars become Python numbers.
 
     Args:
         state: the nested state. Of a ``torch.Generator`` pass ``get_state()``, which is a tensor.

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
+from functools import partial
 from typing import Any
 
 import torch
@@ -56,7 +57,10 @@ class Trainer:
         self.occupancy = OccupancyGrid.full(field.bounds, events.occupancy_resolution(field, settings))
         self._restart_at = 0
         self.optimizer = self._make_optimizer()
-        self._gradient_context = getattr(field, "gradient_context", nullcontext)
+        make = getattr(field, "gradient_context", None)
+        self._gradient_context: Callable[[], AbstractContextManager[Any]] = (
+            nullcontext if make is None else partial(make, faint=settings.faint_gradient)
+        )
         if self.carves:
             events.carve(self)
         if 0 in settings.filter_rays_at:
