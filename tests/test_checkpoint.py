@@ -18,6 +18,7 @@ import safetensors.torch
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from safetensors import SafetensorError
 from torch import Tensor
 
 from gridreg.errors import InputError
@@ -242,21 +243,38 @@ def test_a_half_written_new_one_does_not_hide_the_old_one(tmp_path):
 # ---- a disk that refuses
 
 
-@pytest.mark.parametrize("operation", ["write_bytes", "write_json"])
-def test_a_full_disk_keeps_the_old_checkpoint(tmp_path, monkeypatch, operation):
+FULL = OSError(28, "No space left on device")
+# As the library says it, which writes past Python.
+FULL_FOR_TENSORS = SafetensorError(
+    "Error while serializing: I/O error: No space left on device (os error 28)"
+)
+
+
+@pytest.mark.parametrize(
+    ("owner", "operation", "error"),
+    [(safetensors.torch, "save_file", FULL_FOR_TENSORS), (checkpoint, "write_json", FULL)],
+)
+def test_a_full_disk_keeps_the_old_checkpoint(tmp_path, monkeypatch, owner, operation, error):
     folder = tmp_path / "checkpoint"
     save_checkpoint(folder, {"step": 1})
 
     def full(*_: object, **__: object) -> None:
-        raise OSError(28, "No space left on device")
+        raise error
 
-    monkeypatch.setattr(checkpoint, operation, full)
+    monkeypatch.setattr(owner, operation, full)
     with pytest.raises(InputError, match="checkpoint: cannot write here: no space left") as caught:
         save_checkpoint(folder, {"step": 2})
     assert "\n" not in str(caught.value)
     monkeypatch.undo()
     assert load_checkpoint(folder).state == {"step": 1}
     assert [p.name for p in tmp_path.iterdir()] == ["checkpoint"]
+
+
+def test_both_files_have_the_usual_permissions(tmp_path):
+    save_checkpoint(tmp_path / "checkpoint", {"x": torch.ones(2)})
+    (tmp_path / "other").touch()
+    expected = (tmp_path / "other").stat().st_mode
+    assert {path.stat().st_mode for path in (tmp_path / "checkpoint").iterdir()} == {expected}
 
 
 def test_a_missing_parent_folder(tmp_path):

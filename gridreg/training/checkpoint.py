@@ -33,7 +33,7 @@ from safetensors import SafetensorError
 from torch import Tensor
 
 from gridreg.errors import InputError
-from gridreg.training.files import output_errors, remove_folder, write_json, writing
+from gridreg.training.files import flush, output_errors, remove_folder, write_json
 from gridreg.training.state_tree import flatten_state, unflatten_state
 
 __all__ = ["FORMAT_VERSION", "Checkpoint", "has_checkpoint", "load_checkpoint", "save_checkpoint"]
@@ -108,17 +108,21 @@ def save_checkpoint(
 
 def _write_tensors(path: Path, tensors: dict[str, Tensor]) -> dict[str, Any]:
     """Write a file of tensors from where they lie; returns its size and checksum."""
-    with writing(path) as temporary:
-        try:
-            safetensors.torch.save_file(tensors, temporary)
-        except SafetensorError as error:
-            number = re.search(r"os error (\d+)", str(error))
-            raise OSError(int(number[1]) if number else 0, str(error)) from error
-        with temporary.open("rb") as file:
-            digest = hashlib.sha256()
-            while block := file.read(1 << 20):
-                digest.update(block)
-            return {"bytes": file.tell(), "sha256": digest.hexdigest()}
+    # The library makes files that nobody else may read; this one is to have the usual permissions.
+    path.touch()
+    mode = path.stat().st_mode
+    try:
+        safetensors.torch.save_file(tensors, path)
+    except SafetensorError as error:
+        number = re.search(r"os error (\d+)", str(error))
+        raise OSError(int(number[1]) if number else 0, str(error)) from error
+    path.chmod(mode)
+    flush(path)
+    with path.open("rb") as file:
+        digest = hashlib.sha256()
+        while block := file.read(1 << 20):
+            digest.update(block)
+        return {"bytes": file.tell(), "sha256": digest.hexdigest()}
 
 
 def load_checkpoint(folder: str | os.PathLike[str], *, fingerprint: str | None = None) -> Checkpoint:

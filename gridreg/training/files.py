@@ -22,6 +22,7 @@ from gridreg.errors import InputError
 
 __all__ = [
     "check_output_folder",
+    "flush",
     "output_errors",
     "remove_folder",
     "write_bytes",
@@ -83,7 +84,7 @@ def writing(path: str | os.PathLike[str]) -> Iterator[Path]:
     with output_errors(path):
         try:
             yield temporary
-            _flush(temporary)
+            flush(temporary)
             os.replace(temporary, path)
         except BaseException:
             temporary.unlink(missing_ok=True)
@@ -159,7 +160,8 @@ def remove_folder(path: str | os.PathLike[str]) -> None:
             return
 
 
-def _flush(path: Path) -> None:
+def flush(path: Path) -> None:
+    """Wait until the content of a file is on the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
