@@ -12,6 +12,7 @@ import argparse
 import json
 import sys
 import tempfile
+from contextlib import ExitStack
 from pathlib import Path
 
 import torch
@@ -43,6 +44,7 @@ def score(
     protocol: str,
     backend: str,
     changes: tuple[str, ...],
+    keep: Path | None = None,
 ) -> None:
     name = run if backend == "auto" else f"{run}-{backend}"
     target = result_path(folder.name, name, seed, steps, protocol, changes)
@@ -61,7 +63,8 @@ def score(
     config = configure(options)
     scene = open_scene(config, cache=Path(tempfile.gettempdir()))
     spans = Spans(config.train)
-    with tempfile.TemporaryDirectory() as out:
+    with ExitStack() as stack:
+        out = stack.enter_context(tempfile.TemporaryDirectory()) if keep is None else keep / target.stem
         _, metrics = execute(config, scene, out, watch=spans)
     if metrics is None:
         raise KeyboardInterrupt
@@ -119,6 +122,9 @@ def main() -> int:
     parser.add_argument("--protocol", default="dietnerf8")
     parser.add_argument("--threads", type=int)
     parser.add_argument("--backend", choices=("auto", "torch"), default="auto")
+    parser.add_argument(
+        "--keep", type=Path, metavar="DIR", help="keep the output folders of the runs here, pictures included"
+    )
     parser.add_argument("--table", action="store_true", help="print what is stored, and end")
     arguments = parser.parse_args()
     if arguments.table:
@@ -137,7 +143,16 @@ def main() -> int:
             for run in arguments.runs:
                 folder = arguments.data / scene
                 changes = tuple(arguments.set)
-                score(folder, run, seed, arguments.steps, arguments.protocol, arguments.backend, changes)
+                score(
+                    folder,
+                    run,
+                    seed,
+                    arguments.steps,
+                    arguments.protocol,
+                    arguments.backend,
+                    changes,
+                    arguments.keep,
+                )
     return 0
 
 

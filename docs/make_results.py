@@ -172,7 +172,16 @@ STUDIES = (
         "Pieces of `best`",
         "One piece left out at a time; what a negative figure says is lost without it.",
     ),
-    ("best_more", "More of `best`", "Without masks, as it is now; one weight changed at a time."),
+    (
+        "best_more",
+        "More of `best`",
+        "Without masks; one change at a time, and at last iterations that cost less, which it has now.",
+    ),
+    (
+        "human_search",
+        "`best` on bodies",
+        "What the preset `human` was chosen from; PSNR alone, as validation has no meshes.",
+    ),
     (
         "best_rates",
         "Learning rates of `best`",

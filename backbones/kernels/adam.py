@@ -86,7 +86,10 @@ def _step_compiled(
         members[place] = columns if term.kind == "total_variation" else (3,) if term.kind == "l1" else (4,)
         for column in members[place]:
             factors[column] += term.scale * (1 if term.kind == "l1" else 2) / counts[column]
-    sums = update(p, g, m, v, s, Terms(*factors), shape).tolist()
+    found = update(p, g, m, v, s, Terms(*factors), shape)
+    if not members:
+        return values
+    sums = found.tolist()
     for place, own in members.items():
         values[place] = terms[place].scale * sum(sums[column] / counts[column] for column in own)
     return values

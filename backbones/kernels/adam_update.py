@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -252,6 +253,12 @@ def _grid(table: Any) -> None:
                     )
 
 
+@lru_cache(maxsize=32)
+def _numbers(values: tuple[float, ...]) -> Tensor:
+    """As a tensor: most parameters of an iteration share theirs."""
+    return torch.tensor(values, dtype=torch.float32)
+
+
 def update(
     p: Tensor, g: Tensor, m: Tensor, v: Tensor, moments: Moments, terms: Terms, shape: Layout
 ) -> Tensor:
@@ -267,7 +274,7 @@ def update(
         ``(5,)`` float64: of the parameters before the step, the sums of squared forward differences along
         slabs, rows and nodes, of absolute values and of squares; 0 for those whose factor in ``terms`` is 0.
     """
-    constants = torch.tensor([*moments, *terms], dtype=torch.float32)
+    constants = _numbers((*moments, *terms))
     tensors = [x.view(-1) for x in (p.detach(), g, m, v)]
     if not (terms.slabs or terms.rows or terms.nodes):
         tasks = -(-p.numel() // _FLAT)

@@ -9,7 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from backbones.kernels import autograd
 from backbones.kernels.linear import product_dtype
+from backbones.kernels.sums import thin
 from backbones.vm import LINE_AXES, PLANE_AXES
 from gridreg.attach import open_channels
 from gridreg.errors import InputError
@@ -18,6 +20,7 @@ from . import common, machine, step
 from .common import Record
 from .machine import Machine
 from .situations import Situation, require_grid
+from .stopwatch import replaced
 from .work import PARTS, Counts, Work, work
 
 HELP = "bytes and operations of a step against bandwidth and arithmetic rate, by stage"
@@ -74,6 +77,20 @@ def _updated(trainer: Any) -> int:
     return total
 
 
+def felt_by(situation: Situation, turn: int) -> Tensor:
+    """Which samples of a turn have a gradient of their density, once the small ones are rounded: ``(N,)`` bool."""
+    found: list[Tensor] = []
+
+    def watched(values: Tensor, share: float) -> Tensor:
+        rounded = thin(values, share)
+        found.append(rounded != 0)
+        return rounded
+
+    with replaced(autograd, "thin", watched):
+        situation.run(turn)
+    return found[0]
+
+
 @torch.no_grad()
 def counts_of(situation: Situation, turn: int = 0) -> Counts:
     """What the step of a turn finds.
@@ -86,6 +103,8 @@ def counts_of(situation: Situation, turn: int = 0) -> Counts:
     require_grid(trainer, "roofline")
     if not hasattr(field.decoder, "layers"):
         raise InputError("roofline: found a decoder without layers, expected one of mlp, mlp_fea, mlp_pe")
+    with torch.enable_grad():
+        felt = felt_by(situation, turn)
     situation.rewind(turn)
     trainer.handle.step(situation.step)
     rendered = trainer.render_batch()[0]
@@ -108,6 +127,8 @@ def counts_of(situation: Situation, turn: int = 0) -> Counts:
         appearance_channels=_open(field, "appearance"),
         density_nodes=touched_nodes(u, field.resolution),
         appearance_nodes=touched_nodes(u[coloured], field.resolution),
+        felt=int(felt.sum()),
+        felt_nodes=touched_nodes(u[felt], field.resolution),
         features=decoder.features,
         layers=(sum(decoder.block_sizes), *(layer.weight.shape[0] for layer in decoder.layers)),
         encodings=tuple(encodings),

@@ -77,7 +77,7 @@ class Stopwatch:
         """Stand in for the functions at ``places``; afterwards all is as it was."""
         with ExitStack() as stack:
             for owner, name, stage in places:
-                stack.enter_context(_replaced(owner, name, self.timed(getattr(owner, name), stage)))
+                stack.enter_context(replaced(owner, name, self.timed(getattr(owner, name), stage)))
             yield self
 
     def by_stage(self) -> dict[str, float]:
@@ -89,7 +89,8 @@ class Stopwatch:
 
 
 @contextmanager
-def _replaced(owner: Any, name: str, value: Any) -> Iterator[None]:
+def replaced(owner: Any, name: str, value: Any) -> Iterator[None]:
+    """Let something else stand under a name for a while."""
     own = vars(owner)
     had, before = name in own, own.get(name)
     setattr(owner, name, value)

@@ -6,8 +6,9 @@ once in a stage, however often the stage uses it; numbers have 4 bytes, indices 
 plane or line, with all its channels) counts once for all samples that touch it. Beside that, ``cached`` counts every
 use: what goes through the caches even if nothing is fetched twice.
 
-With R rays, S steps on them inside the box, N samples that are kept, M of them coloured, and a pair of plane and line
-for each of three directions, C channels each (D for density, A for appearance), P nodes touched:
+With R rays, S steps on them inside the box, N samples that are kept, M of them coloured, F of them with a gradient of
+their density that is not 0, and a pair of plane and line for each of three directions, C channels each (D for density,
+A for appearance), P nodes touched (Q by the F):
 
     stage             bytes                                    operations
     rays              48 R                                     24 R
@@ -19,7 +20,7 @@ for each of three directions, C channels each (D for density, A for appearance),
     backward/other    12 N + 24 M                              5 N + 17 M
     backward/network  6 e A M + 12 M + 8 weights               2 (6 A F M) + layers and encodings backwards
     backward/lookup   12 M + 3 e A M + 12 A P                  M (72 A + 27)
-    backward/density  20 N + 12 D P                            N (72 D + 31)
+    backward/density  20 N + 12 D Q                            4 N + F (72 D + 27)
     optimiser         32 a parameter                           13 a parameter
 
 e is the size of a product of plane and line that is handed to the basis: 2 bytes where the basis and the layers
@@ -72,6 +73,7 @@ class Counts:
         rays, steps, cells, samples, coloured: R, S, number of occupancy cells, N and M.
         density_channels, appearance_channels: D and A that are open.
         density_nodes, appearance_nodes: P of either.
+        felt, felt_nodes: F and Q.
         features: F that the decoder reads.
         layers: widths of the decoder, its input first.
         encodings: inputs of the decoder as (dimensions, octaves): features, direction, position if it reads it.
@@ -88,6 +90,8 @@ class Counts:
     appearance_channels: int
     density_nodes: int
     appearance_nodes: int
+    felt: int
+    felt_nodes: int
     features: int
     layers: tuple[int, ...]
     encodings: tuple[tuple[int, int], ...]
@@ -153,10 +157,11 @@ def lookup_work(m: int, channels: int, nodes: int, size: int) -> Work:
     return Work(kept + 4 * channels * nodes, m * (33 * channels + 27), cached=kept + 72 * channels * m)
 
 
-def density_backward_work(n: int, channels: int, nodes: int) -> Work:
-    """Gradients of planes and lines from that of the density."""
+def density_backward_work(n: int, felt: int, channels: int, nodes: int) -> Work:
+    """Gradients of planes and lines from that of the density, of which ``felt`` are not 0."""
     kept = 20 * n
-    return Work(kept + 12 * channels * nodes, n * (72 * channels + 31), cached=kept + 216 * channels * n)
+    operations = 4 * n + felt * (72 * channels + 27)
+    return Work(kept + 12 * channels * nodes, operations, cached=kept + 216 * channels * felt)
 
 
 def lookup_backward_work(m: int, channels: int, nodes: int, size: int) -> Work:
@@ -207,6 +212,6 @@ def work(c: Counts) -> dict[str, Work]:
         "backward/lookup": lookup_backward_work(
             m, c.appearance_channels, c.appearance_nodes, c.component_bytes
         ),
-        "backward/density": density_backward_work(n, c.density_channels, c.density_nodes),
+        "backward/density": density_backward_work(n, c.felt, c.density_channels, c.felt_nodes),
         "optimiser": streamed(32 * c.parameters, 13 * c.parameters),
     }
