@@ -100,7 +100,8 @@ class TotalVariation(Regularizer):
         site: its `grids` are penalised.
         weight: factor of the loss; TensoRF: 0.1 to 1.0 (times 0.02), on CP lines 1e-3 (times 2).
         every: acts in every so many iterations, from the first on, and then so many times as strongly: the mean over
-            iterations stays, and large grids are read less often.
+            iterations stays, and large grids are read less often. Where no other gradient is, Adam, which divides by
+            the root of the mean square, takes smaller steps by about the root of ``every``.
 
     Formula: ``sum over grids and spatial axes of mean((g[i + 1] - g[i])^2)``
     Unit: squared unit of the grid

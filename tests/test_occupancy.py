@@ -4,6 +4,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from torch.nn import functional as F
 
 from gridreg.rendering import OccupancyGrid, camera_rays, visual_hull
 
@@ -28,6 +29,19 @@ def test_update_grows_by_the_dilation():
     grown.update(ball(0.5), step=0.05, dilate=2)
     lower, upper = sharp.tight_bounds(), grown.tight_bounds()
     torch.testing.assert_close((lower - upper).abs(), torch.full((2, 3), 0.2))
+
+
+@given(shape=st.tuples(*[st.integers(2, 7)] * 3), radius=st.integers(0, 3), seed=st.integers(0, 99))
+def test_dilation_is_the_maximum_over_cubes(shape, radius, seed):
+    dense = torch.rand(shape, generator=torch.Generator().manual_seed(seed)) < 0.1
+    grid = OccupancyGrid.full(BOX, shape)
+    grid.update(lambda x: 100.0 * dense[_cells(x, shape)], step=0.05, dilate=radius)
+    expected = F.max_pool3d(dense[None, None].float(), 2 * radius + 1, stride=1, padding=radius)[0, 0]
+    assert torch.equal(grid.cells.float(), expected)
+
+
+def _cells(x, shape):
+    return tuple(((x[:, a] + 1) / 2 * shape[a]).long() for a in range(3))
 
 
 def test_update_looks_only_at_occupied_cells_and_never_leaves_the_hull():

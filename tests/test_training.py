@@ -28,6 +28,7 @@ TINY = TrainSettings(
     shrink_at=(8,),
     filter_rays_at=(16,),
     occupancy_resolution=24,
+    average_from=0.5,
 )
 MASKED = [
     {"name": "FrequencyMask", "site": "density", "until": 0.8},
@@ -106,6 +107,20 @@ def test_a_resumed_run_ends_bit_for_bit_like_an_uninterrupted_one(scene, config,
     for name, value in parameters(whole).items():
         assert torch.equal(value, run.trainer.field.state_dict()[name]), name
     assert metrics["steps"] == 30
+
+
+def test_the_mean_of_the_last_iterates_ends_the_run(scene, config):
+    last = build_trainer(replace(config, train=replace(TINY, average_from=1.0)), scene)
+    seen = {}
+    last.train(each=lambda _: seen.update({last.step: parameters(last)}) or True)
+    mean = build_trainer(config, scene)
+    mean.train()
+    # From the last resampling on, which takes place at 20, every fifth.
+    for name, value in parameters(mean).items():
+        if name in dict(mean.field.named_parameters()):
+            expected = torch.stack([seen[step][name] for step in (20, 25, 30)]).mean(0)
+            torch.testing.assert_close(value, expected)
+    assert mean.average.count == 0
 
 
 def test_what_a_run_leaves_behind(scene, config, tmp_path):
@@ -233,6 +248,7 @@ def test_learning_rates_decay_and_start_anew_at_resampling(scene, config):
         ({"rays": -1}, "train.rays: found -1"),
         ({"learning_rate_grid": math.nan}, "train.learning_rate_grid: found nan"),
         ({"shrink_at": (7,)}, "train.shrink_at: found 7"),
+        ({"average_from": 1.5}, "train.average_from: found 1.5"),
     ],
 )
 def test_settings_out_of_range_are_named(change, message):

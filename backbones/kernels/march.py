@@ -221,17 +221,25 @@ class Marked(NamedTuple):
     offsets: Tensor
 
 
+class _Blocks(NamedTuple):
+    """Whose blocks they are, in which version of the cells, and the blocks."""
+
+    of: weakref.ref[Tensor]
+    version: int | None
+    coarse: Tensor
+
+
 def _coarse(cells: Tensor, grid: Tensor) -> Tensor:
     """Which blocks of cells hold an occupied one; kept for the thread's next march through the same cells."""
     version = None if cells.is_inference() else cells._version
-    of, seen, coarse = getattr(_kept, "blocks", (None, None, None))
-    if coarse is not None and version is not None and of() is cells and seen == version:
-        return coarse  # type: ignore[no-any-return]
+    kept: _Blocks | None = getattr(_kept, "blocks", None)
+    if kept is not None and version is not None and kept.of() is cells and kept.version == version:
+        return kept.coarse
     coarse = torch.empty(*(-(-n // int(_COARSE)) for n in grid.shape), dtype=torch.uint8)
     launch(
         _coarsen, coarse.shape[0], grid, coarse, torch.empty(len(coarse), grid.shape[2], dtype=torch.uint8)
     )
-    _kept.blocks = weakref.ref(cells), version, coarse
+    _kept.blocks = _Blocks(weakref.ref(cells), version, coarse)
     return coarse
 
 

@@ -76,7 +76,7 @@ def _measure(table: Any) -> None:
 
 
 @inline
-def _mixed(bits: int, place: int) -> int:
+def _mixed(bits: Any, place: Any) -> Any:
     """Thirty-two bits that look random: the finalizer of MurmurHash3 (Appleby 2011)."""
     low = int64(0xFFFFFFFF)
     h = (bits ^ (place * int64(0x9E3779B1))) & low

@@ -107,10 +107,15 @@ class OccupancyGrid:
 
 
 def _dilate(cells: Tensor, radius: int) -> Tensor:
-    if radius == 0:
-        return cells
-    grown = F.max_pool3d(cells[None, None].float(), 2 * radius + 1, stride=1, padding=radius)
-    return grown[0, 0].to(torch.uint8)
+    """Maximum over the cube around each cell, one axis after another."""
+    for axis in range(3):
+        grown, size = cells.clone(), cells.shape[axis]
+        for shift in range(1, min(radius, size - 1) + 1):
+            for there, here in ((shift, 0), (0, shift)):
+                target = grown.narrow(axis, there, size - shift)
+                torch.maximum(target, cells.narrow(axis, here, size - shift), out=target)
+        cells = grown
+    return cells
 
 
 def _resized(cells: Tensor, old: Tensor, new: Tensor, resolution: tuple[int, int, int]) -> Tensor:

@@ -38,6 +38,8 @@ class TrainSettings:
         faint_gradient: gradients of densities below this share of their mean size are rounded at random, to 0 or to the
             share, so that their expectation stays; a field that does not offer it has all of them. 0: none.
         transmittance_bound: samples behind this transmittance are dropped.
+        average_from: share of the run from which the mean of the iterates is kept (every fifth of them, none from
+            before the last resampling); at the end of the run it takes the place of the last one. 1: the last stays.
         checkpoint_minutes: between checkpoints.
         evaluate_at: iterations at which the validation views (or, without them, some test views) are scored on the way.
     """
@@ -63,6 +65,7 @@ class TrainSettings:
     pool_weight: float = 0.0
     faint_gradient: float = 0.0
     transmittance_bound: float = 1e-4
+    average_from: float = 1.0
     checkpoint_minutes: float = 2.0
     evaluate_at: tuple[int, ...] = ()
 
@@ -75,6 +78,8 @@ class TrainSettings:
             value = getattr(self, name)
             if not (value > 0 and math.isfinite(value)):
                 raise InputError(f"train.{name}: found {value}, expected a positive number")
+        if not 0 <= self.average_from <= 1:
+            raise InputError(f"train.average_from: found {self.average_from}, expected a share in [0, 1]")
         stray = [s for s in self.shrink_at if s not in self.occupancy_at]
         if stray:
             raise InputError(

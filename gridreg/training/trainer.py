@@ -17,10 +17,14 @@ from gridreg.errors import InputError
 from gridreg.rendering import March, OccupancyGrid, Rendered, render_rays
 from gridreg.scenes import Scene
 from gridreg.training import events
+from gridreg.training.averaging import WeightAverage
 from gridreg.training.rays import RayBank, warp_of
 from gridreg.training.settings import TrainSettings
 
 __all__ = ["StepReport", "Trainer"]
+
+# Iterations from one that is averaged to the next: neighbours hardly differ.
+_AVERAGED = 5
 
 
 class StepReport(dict[str, float]):
@@ -56,6 +60,7 @@ class Trainer:
         self.step = 0
         self.occupancy = OccupancyGrid.full(field.bounds, events.occupancy_resolution(field, settings))
         self._restart_at = 0
+        self.average = WeightAverage()
         self.optimizer = self._make_optimizer()
         make = getattr(field, "gradient_context", None)
         self._gradient_context: Callable[[], AbstractContextManager[Any]] = (
@@ -99,7 +104,17 @@ class Trainer:
         """A fresh optimizer for replaced parameters; the decay starts anew if the settings say so."""
         if self.settings.reset_learning_rate:
             self._restart_at = self.step
+        self.average.clear()
         self.optimizer = self._make_optimizer()
+
+    def _average(self) -> None:
+        """Take the iterate into the mean where it is due, and let the mean take over at the end."""
+        settings = self.settings
+        if settings.average_from < 1 and self.step >= settings.average_from * settings.steps:
+            if self.step % _AVERAGED == 0:
+                self.average.add(self.field.parameters())
+            if self.step == settings.steps:
+                self.average.give(self.field.parameters())
 
     def render_batch(self) -> tuple[Rendered, Tensor]:
         """Draw rays, render them, and composite their targets on the same background ``(R, 3)``."""
@@ -158,6 +173,7 @@ class Trainer:
             self.optimizer.step()
         self.step += 1
         events.run(self)
+        self._average()
         return report
 
     def train(self, until: int | None = None, each: Callable[[StepReport], bool] | None = None) -> None:
@@ -178,6 +194,7 @@ class Trainer:
             "optimizer": self.optimizer.state_dict(),
             "handle": self.handle.state_dict(),
             "generator": self.generator.get_state(),
+            "average": self.average.state_dict(),
             "occupancy": {
                 "bounds": self.occupancy.bounds,
                 "cells": self.occupancy.cells,
@@ -194,6 +211,8 @@ class Trainer:
         self.optimizer.load_state_dict(state["optimizer"])
         self.handle.load_state_dict(state["handle"])
         self.generator.set_state(state["generator"])
+        if "average" in state:
+            self.average.load_state_dict(state["average"])
         self.occupancy = OccupancyGrid(**state["occupancy"])
         self.bank.active = state["active"]
 
