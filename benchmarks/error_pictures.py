@@ -28,6 +28,9 @@ from gridreg.training.files import check_output_folder
 from gridreg.training.outputs import MAX_ERROR, error_map
 from gridreg.training.pictures import labelled, row, save_png, scale_bar, thumbnail, to_picture
 
+LEAST = 64
+"""Pixels that the scale of the error takes."""
+
 
 def kept(folder: Path, scene: str, run: str, seed: int, protocol: str) -> Path:
     """The output folder of a run.
@@ -80,6 +83,8 @@ def main() -> int:
     )
     parser.add_argument("--into", type=Path, required=True, help="folder for the picture")
     arguments = parser.parse_args()
+    if arguments.size < LEAST:
+        raise InputError(f"--size: found {arguments.size}, expected at least {LEAST}, the width of the scale")
     folders = {
         run: kept(arguments.kept, arguments.scene, run, arguments.seed, arguments.protocol)
         for run in arguments.runs
