@@ -29,7 +29,7 @@ Every figure on this page is computed from the files in `benchmarks/results/qual
 `benchmarks/quality.py` wrote; `python docs/make_results.py` writes the page from them. Ours are means over the test
 views of the protocol and, where there are several, over seeds; ± and [ ] are 95 % intervals (Student's t) over seeds,
 or over pairs of the same scene and seed. "α" marks rows that use the pictures' alpha to carve the box. A dash is a run
-that has not been made.
+that has not been made. Runs with one thread ran beside another one on the same two cores.
 
 Published figures are those of the Few TensoRF paper, whose rows for TensoRF and FreeNeRF are its own reproductions. Its
 text does not say which eight views it used; its released configuration has those of `fewtensorf8`. Published baselines
@@ -117,6 +117,11 @@ def minutes(record: dict[str, Any]) -> float:
     return float(record["seconds"]["train"]) / 60
 
 
+def threads(records: dict[int, dict[str, Any]]) -> str:
+    """How many each run had."""
+    return "/".join(map(str, sorted({record["versions"]["threads"] for record in records.values()})))
+
+
 def with_spread(found: Estimate | None, digits: int = 2) -> str:
     """``25.10 ± 0.20 (3)``, ``25.10 (1)`` or a dash."""
     if found is None:
@@ -135,7 +140,7 @@ def few_shot(runs: Runs, protocol: str) -> str:
     """PSNR, SSIM and minutes of every method on every scene, published figures beside them."""
     head = ["method"]
     for scene in SCENES:
-        head += [f"{scene}: PSNR (seeds)", "published", "SSIM 11x11", "training (min)"]
+        head += [f"{scene}: PSNR (seeds)", "published", "SSIM 11x11", "training (min; threads)"]
     rows = []
     for method in METHODS:
         found = [runs.of(scene, protocol, method.run) for scene in SCENES]
@@ -151,7 +156,7 @@ def few_shot(runs: Runs, protocol: str) -> str:
                 with_spread(runs.mean(scene, protocol, method.run, psnr)),
                 "" if published is None else f"{published:.2f}",
                 "–" if seen is None else f"{seen.mean:.3f}",
-                "–" if taken is None else f"{taken.mean:.1f}",
+                "–" if taken is None else f"{taken.mean:.1f}; {threads(runs.of(scene, protocol, method.run))}",
             ]
         rows.append(cells)
     return table(head, rows)
@@ -256,6 +261,23 @@ noise*.
 """
 
 
+PICTURES = """
+## What the pictures show
+
+Made by `benchmarks/quality.py --keep` and `benchmarks/error_pictures.py`, and looked at; they show other people's scenes,
+so they are not part of the project.
+
+* lego, `few_tensorf` (r_144, 26.4 dB): the bucket's inside is blotched, light streaks of fog lie between the tracks and before the grille, a
+  white cloud hangs under the front; in low views (r_72, r_80, r_120) a fringe of haze hangs below the ground plate, which no training view sees
+  from the side. From behind and above (r_0, r_8, r_192) white specks lie on the ground.
+* lego, `best` (the same view, 29.4 dB): no fog and no haze. What is left: edges one pixel wide, the gaps of the tracks and of the grille, the
+  inner wall of the bucket, a little soft. The worst views are the low ones from the side (24.6 dB) and the one from behind and above (24.1 dB).
+* chair, `best` (r_64, 26.0 dB; r_152, 30.1 dB): upright, closed, patterns readable. The ornaments are blurred where they sit on thin wood, the
+  shadow side of the legs is hazy, the armrest's cloth has lost its pattern, and seat and back are a little too bright all over: their sheen
+  is seen from one direction by one training view.
+"""
+
+
 # What is claimed, on which scenes, under which protocol, of which run over which other, and how much (dB).
 CLAIMS: tuple[tuple[str, tuple[str, ...], str, str, str, float], ...] = (
     (
@@ -315,6 +337,7 @@ def page(runs: Runs) -> str:
         bodies(runs),
         "\n## Claims\n\n",
         claims(runs),
+        PICTURES,
         study_tables(),
     ]
     return "".join(parts)
