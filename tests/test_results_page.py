@@ -22,7 +22,8 @@ def store(folder: Path, run: str, scene: str, seed: int, psnr: float, **more: An
     """A run as `benchmarks/quality.py` leaves it, as far as the page reads it."""
     record = {
         "scene": scene, "protocol": "dietnerf8", "run": run, "changes": [], "seed": seed, "uses_alpha": False,
-        "mean": {"psnr": psnr, "ssim_gaussian": 0.9}, "seconds": {"train": 120.0}, "command": ["quality.py"], **more,
+        "mean": {"psnr": psnr, "ssim_gaussian": 0.9}, "seconds": {"train": 120.0}, "command": ["quality.py"],
+        "versions": {"threads": 2}, **more,
     }  # fmt: skip
     name = f"{scene}-{run.replace(':', '+')}-seed{seed}-{len(list(folder.iterdir()))}.json"
     (folder / name).write_text(json.dumps(record))
@@ -40,7 +41,7 @@ def test_figures_are_means_over_seeds_of_whole_runs(results: ModuleType, tmp_pat
     store(tmp_path, "tensorf", "lego", 3, 10.0, changes=["train.rays=9"])
     page = results.few_shot(results.Runs(tmp_path), "dietnerf8")
     row = next(line for line in page.splitlines() if line.startswith("| TensoRF |"))
-    assert "| 24.50 ± 6.35 (2) | 23.83 | 0.900 | 2.0 | – |" in row
+    assert "| 24.50 ± 6.35 (2) | 23.83 | 0.900 | 2.0; 2 | – |" in row
 
 
 def test_gains_are_paired(results: ModuleType, tmp_path: Path) -> None:
