@@ -267,7 +267,8 @@ PICTURES = """
 Made by `benchmarks/quality.py --keep` and `benchmarks/error_pictures.py`, and looked at; they show other people's scenes,
 so they are not part of the project.
 
-* lego, `few_tensorf` (r_144, 26.4 dB): the bucket's inside is blotched, light streaks of fog lie between the tracks and before the grille, a
+* lego, `tensorf` (r_144, 26.5 dB): the bucket's inside is too dark and flat, its rivets doubled; the grille is smeared. No haze, sharp outlines.
+* lego, `few_tensorf` (the same view, 26.4 dB): the bucket's inside is blotched, light streaks of fog lie between the tracks and before the grille, a
   white cloud hangs under the front; in low views (r_72, r_80, r_120) a fringe of haze hangs below the ground plate, which no training view sees
   from the side. From behind and above (r_0, r_8, r_192) white specks lie on the ground.
 * lego, `best` (the same view, 29.4 dB): no fog and no haze. What is left: edges one pixel wide, the gaps of the tracks and of the grille, the
