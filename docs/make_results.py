@@ -156,7 +156,9 @@ def few_shot(runs: Runs, protocol: str) -> str:
                 with_spread(runs.mean(scene, protocol, method.run, psnr)),
                 "" if published is None else f"{published:.2f}",
                 "–" if seen is None else f"{seen.mean:.3f}",
-                "–" if taken is None else f"{taken.mean:.1f}; {threads(runs.of(scene, protocol, method.run))}",
+                "–"
+                if taken is None
+                else f"{taken.mean:.1f}; {threads(runs.of(scene, protocol, method.run))}",
             ]
         rows.append(cells)
     return table(head, rows)
@@ -264,18 +266,22 @@ noise*.
 PICTURES = """
 ## What the pictures show
 
-Made by `benchmarks/quality.py --keep` and `benchmarks/error_pictures.py`, and looked at; they show other people's scenes,
-so they are not part of the project.
 
-* lego, `tensorf` (r_144, 26.5 dB): the bucket's inside is too dark and flat, its rivets doubled; the grille is smeared. No haze, sharp outlines.
-* lego, `few_tensorf` (the same view, 26.4 dB): the bucket's inside is blotched, light streaks of fog lie between the tracks and before the grille, a
-  white cloud hangs under the front; in low views (r_72, r_80, r_120) a fringe of haze hangs below the ground plate, which no training view sees
-  from the side. From behind and above (r_0, r_8, r_192) white specks lie on the ground.
-* lego, `best` (the same view, 29.4 dB): no fog and no haze. What is left: edges one pixel wide, the gaps of the tracks and of the grille, the
-  inner wall of the bucket, a little soft. The worst views are the low ones from the side (24.6 dB) and the one from behind and above (24.1 dB).
-* chair, `best` (r_64, 26.0 dB; r_152, 30.1 dB): upright, closed, patterns readable. The ornaments are blurred where they sit on thin wood, the
-  shadow side of the legs is hazy, the armrest's cloth has lost its pattern, and seat and back are a little too bright all over: their sheen
-  is seen from one direction by one training view.
+Made by `benchmarks/quality.py --keep` and `benchmarks/error_pictures.py`, and looked at; they show other people's
+scenes, so they are not part of the project.
+
+* lego, `tensorf` (r_144, 26.5 dB): the bucket's inside is too dark and flat, its rivets doubled; the grille is
+  smeared. No haze, sharp outlines.
+* lego, `few_tensorf` (the same view, 26.4 dB): the bucket's inside is blotched, light streaks of fog lie between
+  the tracks and before the grille, a white cloud hangs under the front; in low views (r_72, r_80, r_120) a fringe
+  of haze hangs below the ground plate, which no training view sees from the side. From behind and above (r_0, r_8,
+  r_192) white specks lie on the ground.
+* lego, `best` (the same view, 29.4 dB): no fog and no haze. What is left: edges one pixel wide, the gaps of the
+  tracks and of the grille, the inner wall of the bucket, a little soft. The worst views are the low ones from the
+  side (24.6 dB) and the one from behind and above (24.1 dB).
+* chair, `best` (r_64, 26.0 dB; r_152, 30.1 dB): upright, closed, patterns readable. The ornaments are blurred where
+  they sit on thin wood, the shadow side of the legs is hazy, the armrest's cloth has lost its pattern, and seat and
+  back are a little too bright all over: their sheen is seen from one direction by one training view.
 """
 
 

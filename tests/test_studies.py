@@ -41,7 +41,14 @@ ROWS = {
         "all pieces and masks", "no masks", "no occlusion loss", "no L1", "no total variation", "no distortion",
         "no random background",
     ],
-    "best_more": ["best", "total variation 0.008", "distortion 0.01"],
+    "best_more": [
+        "best", "total variation 0.008", "distortion 0.01", "occlusion loss 0.01", "low-pass", "24 and 72 components",
+        "dropout", "initial opacity 0.5", "half the step", "to 200 cubed", "cheaper iterations",
+        "cheaper, mean of the last fifth",
+    ],
+    "human_search": [
+        "best", "total variation 0.01", "total variation 0.04", "no distortion", "24 components to 200 cubed",
+    ],
     "best_search": [
         "best", "learning rate falls to a hundredth", "distortion 0.01", "learning rate of grids 0.04", "L1 five times",
         "distortion 0.001", "no view dependence", "entropy of opacity", "learning rate constant", "initial opacity 0.5",

@@ -42,13 +42,13 @@ class Backend:
     composite_weights: Callable[[Tensor, Tensor], Tensor]
     accumulate: Callable[[Tensor, Tensor, Tensor], Tensor]
     terminate: Callable[[Tensor, Tensor, float], Tensor]
-    pool: Callable[[Tensor, Tensor, float, float, torch.Generator | None], tuple[Tensor, Tensor, Tensor]]
-    spread: Callable[[Tensor, Tensor, Tensor], Tensor]
+    pool: Callable[[Tensor, Tensor, float, float, torch.Generator | None], tuple[Tensor, Tensor, Tensor]] = (
+        plain.pool
+    )
+    spread: Callable[[Tensor, Tensor, Tensor], Tensor] = plain.spread
 
 
-_TORCH = Backend(
-    plain.march, plain.composite_weights, plain.accumulate, plain.terminate, plain.pool, plain.spread
-)
+_TORCH = Backend(plain.march, plain.composite_weights, plain.accumulate, plain.terminate)
 _BACKENDS: dict[str, Backend] = {"torch": _TORCH}
 _CHOICES = ("auto", "compiled", "torch")
 _choice = "auto"
