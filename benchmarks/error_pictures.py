@@ -96,8 +96,7 @@ def main() -> int:
         raise InputError(f"--view: found {view!r}, expected one of {names}")
     scene = load_scene(arguments.data / arguments.scene, arguments.protocol)
     place = scene.test.names.index(view)
-    rgba = scene.test.rgba[place]
-    target = rgba[..., :3] * rgba[..., 3:] + (1 - rgba[..., 3:]) * scene.background
+    target = scene.test.composited(scene.background)[place]
     renders = {
         run: (
             torch.from_numpy(imageio.imread(folder / "test" / f"{view}.png") / 255.0).float(),

@@ -197,8 +197,7 @@ def _dots_backward(
         slope = _cut(found, saved.rows, weight.shape[1])
     of_x = torch.empty(saved.rows, 0, dtype=torch.bfloat16)
     if columns:
-        found = dots.multiply(slope, dots.pack(saved.weights[0].detach().t()[:columns]))
-        of_x = found
+        of_x = dots.multiply(slope, dots.pack(saved.weights[0].detach().t()[:columns]))
     return of_x, of_layers[::-1]
 
 

@@ -26,8 +26,9 @@ from gridreg.rendering.pooling import UNIT
 
 __all__ = ["pool", "spread"]
 
-# Rays of one task.
+# Rays of one task; samples or pools of one.
 _RAYS = 64
+_SAMPLES = 4096
 
 
 @inline
@@ -137,15 +138,15 @@ def pool(
 
 @kernel
 def _spread(table: Any) -> None:
-    """Colours ``(P, C)``, pool of each sample, colours of the samples ``(N, C)``, samples of one task."""
+    """Colours ``(P, C)``, pool of each sample, colours of the samples ``(N, C)``."""
     colours, pools = matrix(table, 0, float32), vector(table, 1, int64)
-    out, high = matrix(table, 2, float32), integer(table, 3)
+    out = matrix(table, 2, float32)
     channels = out.shape[1]
     while True:
         task = next_task(table)
         if task < 0:
             break
-        for n in range(task * high, min((task + 1) * high, out.shape[0])):
+        for n in range(task * _SAMPLES, min((task + 1) * _SAMPLES, out.shape[0])):
             number = pools[n]
             for k in range(channels):
                 out[n, k] = colours[number, k] if number >= 0 else float32(0)
@@ -153,15 +154,15 @@ def _spread(table: Any) -> None:
 
 @kernel
 def _gather(table: Any) -> None:
-    """Speakers, gradients of samples ``(N, C)``, pool of each sample; gradients of colours ``(P, C)``, pools a task."""
+    """Speakers, gradients of samples ``(N, C)``, pool of each sample; gradients of colours ``(P, C)``."""
     speakers, gradient = vector(table, 0, int64), matrix(table, 1, float32)
-    pools, out, high = vector(table, 2, int64), matrix(table, 3, float32), integer(table, 4)
+    pools, out = vector(table, 2, int64), matrix(table, 3, float32)
     channels, samples = out.shape[1], gradient.shape[0]
     while True:
         task = next_task(table)
         if task < 0:
             break
-        for number in range(task * high, min((task + 1) * high, out.shape[0])):
+        for number in range(task * _SAMPLES, min((task + 1) * _SAMPLES, out.shape[0])):
             # A pool lies around its speaker, with nothing between its members but what is in no pool.
             first = speakers[number]
             while first > 0 and (pools[first - 1] == number or pools[first - 1] < 0):
@@ -176,15 +177,12 @@ def _gather(table: Any) -> None:
                 n += 1
 
 
-_SAMPLES = 4096
-
-
 class _Spread(Function):
     @staticmethod
     def forward(ctx: Any, colours: Tensor, pools: Tensor, speakers: Tensor) -> Tensor:
         ctx.save_for_backward(pools, speakers)
         out = torch.empty(pools.shape[0], colours.shape[1])
-        launch(_spread, -(-len(pools) // _SAMPLES), colours.detach().contiguous(), pools, out, _SAMPLES)
+        launch(_spread, -(-len(pools) // _SAMPLES), colours.detach().contiguous(), pools, out)
         return out
 
     @staticmethod
@@ -193,7 +191,7 @@ class _Spread(Function):
         pools, speakers = ctx.saved_tensors
         out = torch.empty(speakers.shape[0], gradient.shape[1])
         tasks = -(-len(speakers) // _SAMPLES)
-        launch(_gather, tasks, speakers, gradient.contiguous(), pools, out, _SAMPLES)
+        launch(_gather, tasks, speakers, gradient.contiguous(), pools, out)
         return out, None, None
 
 

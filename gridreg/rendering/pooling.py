@@ -1,9 +1,9 @@
 """One colour for several faint samples: most samples that a ray sees weigh next to nothing.
 
 Neighbours among them are pooled until they weigh a given amount, and one of them, drawn in proportion to its weight,
-lends its colour to the pool. The expected colour of a ray, and the expected gradient
-of every colour, are those of evaluating them all; the gradient of a weight sees the colour of its pool, in expectation
-the pool's mean, in place of the sample's own.
+lends its colour to the pool. The expected colour of a ray, and the expected gradient of every colour, are those of
+evaluating them all; the gradient of a weight sees the colour of its pool, in expectation the pool's mean, in place of
+the sample's own.
 """
 
 from __future__ import annotations
