@@ -42,6 +42,33 @@ def test_weights(counts, seed):
 
 
 @settings(max_examples=60, deadline=None)
+@given(counts=counts_lists, seed=st.integers(0, 2**31))
+def test_pixels(counts, seed):
+    weights, colours, offsets = random_packed(seed, counts)
+    g = torch.Generator().manual_seed(seed)
+    t, background = torch.rand(len(weights), generator=g), torch.rand(len(counts), 3, generator=g)
+    results = []
+    for module, kind in ((composite, torch.float32), (plain, torch.float64)):
+        given_ = [x.to(kind).requires_grad_() for x in (weights.clone(), colours.clone())]
+        out = module.pixels(*given_, t.to(kind), background.to(kind), offsets)
+        results.append([*out, *gradients(torch.cat([x.reshape(-1) for x in out]), given_, seed)])
+    for a, b in zip(*results, strict=True):
+        torch.testing.assert_close(a, b.float(), rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("place", [2, 3])
+def test_distances_and_backgrounds_may_need_gradients(place):
+    weights, colours, offsets = random_packed(1, [3, 0, 4])
+    given_ = [weights, colours, torch.rand(7), torch.rand(3, 3)]
+    given_[place].requires_grad_()
+    found = torch.cat([x.reshape(-1) for x in composite.pixels(*given_, offsets)])
+    expected = torch.cat([x.reshape(-1) for x in plain.pixels(*given_, offsets)])
+    torch.testing.assert_close(
+        *(gradients(x, (given_[place],), 0)[0] for x in (found, expected)), rtol=1e-5, atol=1e-6
+    )
+
+
+@settings(max_examples=60, deadline=None)
 @given(counts=counts_lists, seed=st.integers(0, 2**31), channels=st.integers(0, 9))
 def test_sums(counts, seed, channels):
     weights, values, offsets = random_packed(seed, counts, channels)

@@ -23,9 +23,10 @@ from backbones.kernels.compiler import (
 from backbones.kernels.march import march
 from backbones.kernels.pools import pool, spread
 from backbones.kernels.threading import launch
+from gridreg.rendering import plain
 from gridreg.rendering.backends import Backend, register_backend
 
-__all__ = ["accumulate", "composite_weights", "register", "terminate"]
+__all__ = ["accumulate", "composite_weights", "pixels", "register", "terminate"]
 
 # Rays of one task.
 _RAYS = 64
@@ -166,6 +167,81 @@ class _Sums(Function):
 
 
 @kernel
+def _pixels_forward(table: Any) -> None:
+    """Offsets, weights, colours, distances, background; colour, opacity and depth of every ray."""
+    offsets, weights = vector(table, 0, int64), vector(table, 1, float32)
+    colours, t, background = matrix(table, 2, float32), vector(table, 3, float32), matrix(table, 4, float32)
+    out, opacity, depth = matrix(table, 5, float32), vector(table, 6, float32), vector(table, 7, float32)
+    rays, samples = offsets.shape[0] - 1, weights.shape[0]
+    while True:
+        task = next_task(table)
+        if task < 0:
+            break
+        for ray in range(task * _RAYS, min((task + 1) * _RAYS, rays)):
+            red, green, blue = float32(0), float32(0), float32(0)
+            sum_, far = float32(0), float32(0)
+            for n in range(max(offsets[ray], 0), min(offsets[ray + 1], samples)):
+                weight = weights[n]
+                red += weight * colours[n, 0]
+                green += weight * colours[n, 1]
+                blue += weight * colours[n, 2]
+                sum_ += weight
+                far += weight * t[n]
+            rest = float32(1) - sum_
+            out[ray, 0] = red + rest * background[ray, 0]
+            out[ray, 1] = green + rest * background[ray, 1]
+            out[ray, 2] = blue + rest * background[ray, 2]
+            opacity[ray], depth[ray] = sum_, far
+
+
+@kernel
+def _pixels_backward(table: Any) -> None:
+    """Arguments as of `_pixels_forward`, with gradients for the results; gradients of weights and colours."""
+    offsets, weights = vector(table, 0, int64), vector(table, 1, float32)
+    colours, t, background = matrix(table, 2, float32), vector(table, 3, float32), matrix(table, 4, float32)
+    g, of_opacity, of_depth = matrix(table, 5, float32), vector(table, 6, float32), vector(table, 7, float32)
+    of_weights, of_colours = vector(table, 8, float32), matrix(table, 9, float32)
+    rays, samples = offsets.shape[0] - 1, weights.shape[0]
+    while True:
+        task = next_task(table)
+        if task < 0:
+            break
+        for ray in range(task * _RAYS, min((task + 1) * _RAYS, rays)):
+            red, green, blue = g[ray, 0], g[ray, 1], g[ray, 2]
+            hidden = red * background[ray, 0] + green * background[ray, 1] + blue * background[ray, 2]
+            base, slope = of_opacity[ray] - hidden, of_depth[ray]
+            for n in range(max(offsets[ray], 0), min(offsets[ray + 1], samples)):
+                weight = weights[n]
+                seen = red * colours[n, 0] + green * colours[n, 1] + blue * colours[n, 2]
+                of_weights[n] = seen + base + slope * t[n]
+                of_colours[n, 0] = weight * red
+                of_colours[n, 1] = weight * green
+                of_colours[n, 2] = weight * blue
+
+
+class _Pixels(Function):
+    @staticmethod
+    def forward(
+        ctx: Any, weights: Tensor, colours: Tensor, t: Tensor, background: Tensor, offsets: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        given = tuple(x.contiguous() for x in (offsets, weights, colours, t, background))
+        rays = offsets.numel() - 1
+        out = torch.empty(rays, 3), torch.empty(rays), torch.empty(rays)
+        launch(_pixels_forward, _tasks(offsets), *given, *out)
+        ctx.save_for_backward(*given)
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradient: Tensor) -> tuple[Tensor | None, ...]:
+        given = ctx.saved_tensors
+        of_weights, of_colours = torch.empty_like(given[1]), torch.empty_like(given[2])
+        slopes = (x.contiguous() for x in gradient)
+        launch(_pixels_backward, _tasks(given[0]), *given, *slopes, of_weights, of_colours)
+        return of_weights, of_colours, None, None, None
+
+
+@kernel
 def _seen(table: Any) -> None:
     """Whether the transmittance before each sample is at least a bound."""
     offsets, through = vector(table, 0, int64), vector(table, 1, float32)
@@ -192,6 +268,15 @@ def accumulate(weights: Tensor, values: Tensor, offsets: Tensor) -> Tensor:
     return _Sums.apply(weights, values, offsets.contiguous())  # type: ignore[no-any-return, no-untyped-call]
 
 
+def pixels(
+    weights: Tensor, colours: Tensor, t: Tensor, background: Tensor, offsets: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """See `gridreg.rendering.backends.pixels`; CPU float32 tensors."""
+    if t.requires_grad or background.requires_grad:
+        return plain.pixels(weights, colours, t, background, offsets)
+    return _Pixels.apply(weights, colours, t, background, offsets)  # type: ignore[no-any-return, no-untyped-call]
+
+
 @torch.no_grad()
 def terminate(optical_depth: Tensor, offsets: Tensor, bound: float) -> Tensor:
     """See `gridreg.rendering.backends.terminate`; CPU float32 tensors."""
@@ -203,4 +288,6 @@ def terminate(optical_depth: Tensor, offsets: Tensor, bound: float) -> Tensor:
 
 def register() -> None:
     """Make the compiled march and compositing available to `gridreg.rendering.backends`."""
-    register_backend("compiled", Backend(march, composite_weights, accumulate, terminate, pool, spread))
+    register_backend(
+        "compiled", Backend(march, composite_weights, accumulate, terminate, pool, spread, pixels)
+    )

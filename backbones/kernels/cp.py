@@ -26,7 +26,7 @@ from backbones.kernels.compiler import (
 )
 from backbones.kernels.lookup import ahead, linear, prefetch_row
 from backbones.kernels.places import BATCH, PLACES, batch, find
-from backbones.kernels.rows import ALONE, ENTRY, TASKS, list_by_row, span
+from backbones.kernels.rows import ALONE, ENTRY, TASKS, felt, list_by_row, span
 from backbones.kernels.simd import LANES, load, one, store, total, wide
 from backbones.kernels.threading import launch
 from backbones.kernels.workspace import room
@@ -228,6 +228,7 @@ def features(u: Tensor, lines: Sequence[Tensor], read: int) -> Tensor:
 def _gradients(
     compiled: Kernel, u: Tensor, lines: Sequence[Tensor], read: int, upstream: Tensor
 ) -> list[Tensor]:
+    u, upstream = felt(u, upstream)
     listing = list_by_row(u, upstream, (lines[2].shape[0], lines[1].shape[0], lines[0].shape[0]), 3)
     gradients = [torch.zeros_like(line) for line in lines]
     waste = room("waste", 3 * TASKS, lines[0].shape[1]).zero_()

@@ -7,7 +7,7 @@ given by ray are encoded once per ray and copied to the samples.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,11 +15,10 @@ from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
-from backbones.kernels.bfloat16 import load_low, store_low
+from backbones.kernels.bfloat16 import store_low
 from backbones.kernels.chain import chain_backward, chain_forward
 from backbones.kernels.compiler import (
     float32,
-    inline,
     int64,
     integer,
     kernel,
@@ -30,7 +29,9 @@ from backbones.kernels.compiler import (
 )
 from backbones.kernels.encode import MOST_OCTAVES, encode, encode_together
 from backbones.kernels.linear import Layer, Precision, check_layers, check_precision, mlp, product_dtype
-from backbones.kernels.simd import LANES, load, one, store, wide
+from backbones.kernels.octaves import read_octaves, write_octaves
+from backbones.kernels.perceptron import Block, fits, perceptron
+from backbones.kernels.simd import LANES, one, wide
 from backbones.kernels.threading import launch
 from gridreg.errors import InputError
 from gridreg.rendering.backends import takes_compiled
@@ -39,40 +40,6 @@ __all__ = ["Block", "encoded_mlp"]
 
 # Rows of one task.
 _ROWS = 256
-
-
-class Block(NamedTuple):
-    """One of the inputs of `encoded_mlp`.
-
-    Args:
-        x: ``(N, D)``, or ``(R, D)`` with ``rows``.
-        octaves: of its positional encoding.
-        rows: ``(N,)`` int64, the row of ``x`` for each sample; None: its own.
-    """
-
-    x: Tensor
-    octaves: int
-    rows: Tensor | None = None
-
-    @property
-    def width(self) -> int:
-        """Columns of the encoding."""
-        return int(self.x.shape[1]) * (1 + 2 * self.octaves)
-
-
-@inline
-def _write_step(
-    x: Any, s: Any, c: Any, out: Any, i: int, at: int, dims: int, octaves: int, like: Any
-) -> None:
-    """Write all octaves of elements ``i`` on; ``sin 2a = 2 sin a cos a``, ``cos 2a = 1 - 2 sin^2 a``."""
-    sine, cosine = load(s, i, like), load(c, i, like)
-    store_low(out, at + i, load(x, i, like))
-    for octave in range(octaves):
-        place = at + i + (1 + 2 * octave) * dims
-        store_low(out, place, sine)
-        store_low(out, place + dims, cosine)
-        doubled = float32(2) * sine
-        sine, cosine = doubled * cosine, float32(1) - doubled * sine
 
 
 @kernel
@@ -89,9 +56,9 @@ def _write(table: Any) -> None:
         for n in range(task * _ROWS, min((task + 1) * _ROWS, x.shape[0])):
             xs, ss, cs, row = x[n], s[n], c[n], out[n]
             for i in range(0, split, LANES):
-                _write_step(xs, ss, cs, row, i, at, dims, octaves, wide())
+                write_octaves(xs, ss, cs, i, row, at + i, dims, octaves, wide(), store_low)
             for i in range(split, dims):
-                _write_step(xs, ss, cs, row, i, at, dims, octaves, one())
+                write_octaves(xs, ss, cs, i, row, at + i, dims, octaves, one(), store_low)
 
 
 @kernel
@@ -109,20 +76,6 @@ def _copy(table: Any) -> None:
                 row[at + i] = source[i]
 
 
-@inline
-def _read_step(x: Any, g: Any, result: Any, i: int, at: int, dims: int, octaves: int, like: Any) -> None:
-    """``g_x + sum over octaves of f (cos g_sin - sin g_cos)``."""
-    total = load_low(g, at + i, like)
-    frequency = float32(1)
-    for octave in range(octaves):
-        place = at + i + (1 + 2 * octave) * dims
-        sine, cosine = load_low(x, place, like), load_low(x, place + dims, like)
-        slope = cosine * load_low(g, place, like) - sine * load_low(g, place + dims, like)
-        total = total + frequency * slope
-        frequency = frequency * float32(2)
-    store(result, i, total)
-
-
 @kernel
 def _read(table: Any) -> None:
     """Encodings ``(M, W)`` and their gradient ``(M, G)`` in bfloat16, result ``(N, D)``, first column, octaves."""
@@ -137,9 +90,9 @@ def _read(table: Any) -> None:
         for n in range(task * _ROWS, min((task + 1) * _ROWS, result.shape[0])):
             row, slope, into = x[n], g[n], result[n]
             for i in range(0, split, LANES):
-                _read_step(row, slope, into, i, at, dims, octaves, wide())
+                read_octaves(row, at + i, slope, at + i, into, i, dims, octaves, wide())
             for i in range(split, dims):
-                _read_step(row, slope, into, i, at, dims, octaves, one())
+                read_octaves(row, at + i, slope, at + i, into, i, dims, octaves, one())
 
 
 def _encode_into(out: Tensor, at: int, x: Tensor, octaves: int) -> None:
@@ -259,6 +212,8 @@ def encoded_mlp(
         and all(block.octaves <= MOST_OCTAVES for block in given)
         and not any(block.x.requires_grad for block in given if block.rows is not None)
     )
+    if fused and fits(given, layers):
+        return perceptron(given, count, flat)
     if fused:
         out: Tensor = _EncodedMLP.apply(given, count, *(block.x for block in given), *flat)  # type: ignore[no-untyped-call]
         return out

@@ -31,7 +31,7 @@ from backbones.kernels.simd import load, one
 from backbones.kernels.threading import launch
 from backbones.kernels.workspace import room
 
-__all__ = ["ALONE", "ENTRY", "TASKS", "Listing", "list_by_row", "span"]
+__all__ = ["ALONE", "ENTRY", "TASKS", "Listing", "felt", "list_by_row", "span"]
 
 # Tasks for each axis or plane: more than threads, so that an unlucky thread does not hold the others up.
 TASKS = 16
@@ -88,11 +88,6 @@ def _sort(table: Any) -> None:
         edge, begin, base = edges[axis], axis * stride, axis * samples
         for n in range(samples):
             rows[base + n] = node(load(u, 3 * n + axis, one()), edge)[0]
-        if summed:
-            # Behind the last row, and so in no task.
-            for n in range(samples):
-                if upstream[n] == float32(0):
-                    rows[base + n] = edge - 1
         _count(rows, base, samples, starts, begin, edge)
         for first in range(0, samples, BATCH):
             count = min(int64(BATCH), samples - first)
@@ -112,12 +107,25 @@ def _sort(table: Any) -> None:
                 to_shares[to + 3] = upstream[first + q] if summed else float32(1)
 
 
+def felt(u: Tensor, upstream: Tensor) -> tuple[Tensor, Tensor]:
+    """Samples whose gradient is not 0, if there is one number for each: what most rays see is hardly anything.
+
+    Args:
+        u: ``(N, 3)``.
+        upstream: gradients, ``(N,)`` or ``(N, C)``.
+    """
+    if upstream.dim() > 1:
+        return u, upstream
+    kept = upstream.nonzero().squeeze(1)
+    return (u, upstream) if len(kept) == len(u) else (u.index_select(0, kept), upstream.index_select(0, kept))
+
+
 def list_by_row(u: Tensor, upstream: Tensor, shape: tuple[int, int, int], sorts: int) -> Listing:
     """Sort samples by row, once along each of the first axes; the result is overwritten by the thread's next call.
 
     Args:
         u: ``(N, 3)`` in [0, 1].
-        upstream: gradients; if ``(N,)``, samples where it is 0 are left out.
+        upstream: gradients, ``(N,)`` or ``(N, C)``.
         shape: nodes along x, y and z.
         sorts: number of axes.
     """

@@ -24,7 +24,7 @@ from backbones.kernels.compiler import (
 )
 from backbones.kernels.lookup import ahead, bilinear, corners, linear, prefetch_cell, prefetch_row
 from backbones.kernels.places import axes
-from backbones.kernels.rows import ALONE, ENTRY, TASKS, list_by_row, span
+from backbones.kernels.rows import ALONE, ENTRY, TASKS, felt, list_by_row, span
 from backbones.kernels.simd import LANES, load, one, store, wide
 from backbones.kernels.sums import fold
 from backbones.kernels.threading import launch
@@ -167,6 +167,7 @@ def _run(
     plane_gradients: Sequence[Tensor],
 ) -> list[Tensor]:
     nodes = [line.shape[0] for line in lines]
+    u, upstream = felt(u, upstream)
     listing = list_by_row(u, upstream, (nodes[2], nodes[1], nodes[0]), 2)
     copies = room("copies", TASKS, sum(nodes), lines[0].shape[1])
     waste = room("waste", 3 * TASKS, 2, lines[0].shape[1]).zero_()

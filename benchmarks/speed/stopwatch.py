@@ -13,7 +13,7 @@ import torch
 
 import gridreg.training.trainer as trainer_module
 from backbones import kernels
-from backbones.kernels import autograd, cp, encoded, linear, vm_gradient
+from backbones.kernels import autograd, cp, encoded, linear, perceptron, vm_gradient
 from gridreg.rendering import backends, plain, render
 from gridreg.training import Trainer
 
@@ -124,6 +124,7 @@ def places_of(trainer: Trainer) -> list[Place]:
         Place(vm_gradient, "features_backward", "backward/lookup"),
         Place(cp, "features_backward", "backward/lookup"),
         Place(encoded, "chain_backward", "backward/network"),
+        Place(perceptron, "gradients", "backward/network"),
         Place(linear, "chain_backward", "backward/network"),
         Place(trainer.optimizer, "step", "optimiser"),
     ]

@@ -22,6 +22,7 @@ __all__ = [
     "chosen_backend",
     "composite_weights",
     "march",
+    "pixels",
     "pool",
     "register_backend",
     "registered_backends",
@@ -46,6 +47,7 @@ class Backend:
         plain.pool
     )
     spread: Callable[[Tensor, Tensor, Tensor], Tensor] = plain.spread
+    pixels: Callable[[Tensor, Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor]] = plain.pixels
 
 
 _TORCH = Backend(plain.march, plain.composite_weights, plain.accumulate, plain.terminate)
@@ -220,6 +222,40 @@ def accumulate(weights: Tensor, values: Tensor, offsets: Tensor) -> Tensor:
     if values.dim() != 2 or values.shape[0] != weights.shape[0]:
         raise InputError(f"values: found shape {tuple(values.shape)}, expected ({weights.shape[0]}, K)")
     return _backend(weights, values).accumulate(weights, values, offsets)
+
+
+def pixels(
+    weights: Tensor, colours: Tensor, t: Tensor, background: Tensor, offsets: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Colour, opacity and depth of every ray.
+
+    Args:
+        weights: ``(N,)``.
+        colours: ``(N, 3)``.
+        t: ``(N,)`` distance along the ray, world units.
+        background: ``(R, 3)``, seen through what is left.
+        offsets: ``(R + 1,)`` int64.
+
+    Returns:
+        ``sum w c + (1 - sum w) background (R, 3)``, ``sum w (R,)`` and ``sum w t (R,)``, differentiable once.
+
+    Raises:
+        InputError: if the shapes do not fit.
+
+    Example:
+        >>> w, c, t = torch.tensor([0.5, 0.25]), torch.ones(2, 3), torch.tensor([1.0, 2.0])
+        >>> [x.tolist() for x in pixels(w, c, t, torch.zeros(1, 3), torch.tensor([0, 2]))]
+        [[[0.75, 0.75, 0.75]], [0.75], [1.0]]
+    """
+    plain.check_packed(weights, offsets, "weights")
+    for name, value, shape in (
+        ("colours", colours, (len(weights), 3)),
+        ("t", t, (len(weights),)),
+        ("background", background, (len(offsets) - 1, 3)),
+    ):
+        if tuple(value.shape) != shape:
+            raise InputError(f"{name}: found shape {tuple(value.shape)}, expected {shape}")
+    return _backend(weights, colours, t, background).pixels(weights, colours, t, background, offsets)
 
 
 def terminate(optical_depth: Tensor, offsets: Tensor, bound: float) -> Tensor:

@@ -175,6 +175,16 @@ def accumulate(weights: Tensor, values: Tensor, offsets: Tensor) -> Tensor:
     return sums.index_add(0, ray, weights[:, None] * values)
 
 
+def pixels(
+    weights: Tensor, colours: Tensor, t: Tensor, background: Tensor, offsets: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """See `gridreg.rendering.backends.pixels`."""
+    stacked = torch.cat([colours, t[:, None], torch.ones_like(t[:, None])], dim=-1)
+    total = accumulate(weights, stacked, offsets)
+    opacity = total[:, 4]
+    return total[:, :3] + (1 - opacity)[:, None] * background, opacity, total[:, 3]
+
+
 @torch.no_grad()
 def terminate(optical_depth: Tensor, offsets: Tensor, bound: float) -> Tensor:
     """See `gridreg.rendering.backends.terminate`."""

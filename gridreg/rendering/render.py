@@ -227,11 +227,10 @@ def composite(samples: RaySamples) -> Rendered:
     """Pixels from samples with colours and background: ``sum w c + (1 - sum w) background``."""
     if samples.colours is None or samples.background is None:
         raise ValueError("samples: found no colours or no background, expected both for compositing")
-    stacked = torch.cat([samples.colours, samples.t[:, None], torch.ones_like(samples.t[:, None])], dim=-1)
-    total = backends.accumulate(samples.weights, stacked, samples.offsets)
-    opacity = total[:, 4]
-    colour = total[:, :3] + (1 - opacity)[:, None] * samples.background
-    return Rendered(colour, opacity, total[:, 3], samples)
+    colour, opacity, depth = backends.pixels(
+        samples.weights, samples.colours, samples.t, samples.background, samples.offsets
+    )
+    return Rendered(colour, opacity, depth, samples)
 
 
 @torch.no_grad()

@@ -1,0 +1,46 @@
+"""Positional encodings in bfloat16, for kernels: written from a sine and a cosine, and their gradient read back."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from backbones.kernels.bfloat16 import load_low
+from backbones.kernels.compiler import float32, inline
+from backbones.kernels.simd import load, store
+
+__all__ = ["read_octaves", "write_octaves"]
+
+
+@inline
+def write_octaves(
+    x: Any, s: Any, c: Any, i: Any, out: Any, to: Any, dims: Any, octaves: Any, like: Any, write: Any
+) -> None:
+    """Write all octaves of elements ``i`` on; ``sin 2a = 2 sin a cos a``, ``cos 2a = 1 - 2 sin^2 a``.
+
+    ``write`` is `store_low`, or what does the same.
+    """
+    sine, cosine = load(s, i, like), load(c, i, like)
+    write(out, to, load(x, i, like))
+    for octave in range(octaves):
+        place = to + (1 + 2 * octave) * dims
+        write(out, place, sine)
+        write(out, place + dims, cosine)
+        doubled = float32(2) * sine
+        sine, cosine = doubled * cosine, float32(1) - doubled * sine
+
+
+@inline
+def read_octaves(
+    x: Any, at: Any, g: Any, begin: Any, result: Any, to: Any, dims: Any, octaves: Any, like: Any
+) -> None:
+    """Write ``g_x + sum over octaves of f (cos g_sin - sin g_cos)``, from encodings at ``at`` and gradients at
+    ``begin``."""
+    total = load_low(g, begin, like)
+    frequency = float32(1)
+    for octave in range(octaves):
+        place = (1 + 2 * octave) * dims
+        sine, cosine = load_low(x, at + place, like), load_low(x, at + place + dims, like)
+        slope = cosine * load_low(g, begin + place, like) - sine * load_low(g, begin + place + dims, like)
+        total = total + frequency * slope
+        frequency = frequency * float32(2)
+    store(result, to, total)
