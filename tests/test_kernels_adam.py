@@ -231,11 +231,11 @@ class TestExactness:
 def test_which_tensors_take_the_kernel(monkeypatch):
     calls = []
 
-    def record(p, *rest):
-        calls.append(p.dtype)
-        return adam_update.update(p, *rest)
+    def record(jobs):
+        calls.extend(job.p.dtype for job in jobs)
+        return adam_update.update_flat(jobs)
 
-    monkeypatch.setattr(adam, "update", record)
+    monkeypatch.setattr(adam, "update_flat", record)
     strided = torch.nn.Parameter(torch.zeros(3, 2).T)
     for p in (grid((2, 3), 0), grid((2, 3), 0, torch.float64), strided):
         p.grad = torch.ones_like(p)

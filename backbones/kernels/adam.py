@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from backbones.kernels.adam_layout import Moments, Terms, layout
-from backbones.kernels.adam_update import update
+from backbones.kernels.adam_layout import Layout, Moments, Terms, layout
+from backbones.kernels.adam_update import Job, update, update_flat
 from gridreg.base import LocalTerm
 from gridreg.errors import InputError
 from gridreg.rendering.backends import takes_compiled
@@ -60,10 +60,39 @@ def _step_plainly(p: Tensor, g: Tensor, m: Tensor, v: Tensor, s: Moments) -> Non
     p.addcdiv_(m, v.sqrt().mul_(s.root).add_(s.eps), value=-s.rate)
 
 
-def _step_compiled(
+class _Plan(NamedTuple):
+    """A step of the kernel.
+
+    Args:
+        job: what it does.
+        shape: of the tensors.
+        terms: whose values are wanted.
+        values: of each term, as far as they are known.
+        members: by place in terms, the columns of the kernel's sums that make its value.
+        counts: by column, what the sum is divided by.
+    """
+
+    job: Job
+    shape: Layout
+    terms: Sequence[LocalTerm]
+    values: list[float]
+    members: dict[int, tuple[int, ...]]
+    counts: list[float]
+
+    def finish(self, sums: Tensor) -> list[float]:
+        """Values of the terms, from the kernel's sums by parts."""
+        if self.members:
+            found = sums.sum(0).tolist()
+            for place, own in self.members.items():
+                mean = sum(found[column] / self.counts[column] for column in own)
+                self.values[place] = self.terms[place].scale * mean
+        return self.values
+
+
+def _plan(
     p: Tensor, g: Tensor, m: Tensor, v: Tensor, s: Moments, decay: float, terms: Sequence[LocalTerm]
-) -> list[float]:
-    """One step of the kernel; returns the values of the terms, the odd ones added to the gradient before."""
+) -> _Plan:
+    """One step of the kernel; odd terms are added to the gradient at once."""
     axes: tuple[int, ...] = next(
         (_axes(term) for term in terms if layout(p.shape, _axes(term)) and _axes(term)), ()
     )
@@ -86,13 +115,7 @@ def _step_compiled(
         members[place] = columns if term.kind == "total_variation" else (3,) if term.kind == "l1" else (4,)
         for column in members[place]:
             factors[column] += term.scale * (1 if term.kind == "l1" else 2) / counts[column]
-    found = update(p, g, m, v, s, Terms(*factors), shape)
-    if not members:
-        return values
-    sums = found.tolist()
-    for place, own in members.items():
-        values[place] = terms[place].scale * sum(sums[column] / counts[column] for column in own)
-    return values
+    return _Plan(Job(p, g, m, v, s, Terms(*factors)), shape, terms, values, members, counts)
 
 
 class FusedAdam(torch.optim.Optimizer):
@@ -189,14 +212,28 @@ class FusedAdam(torch.optim.Optimizer):
                     f"{term.name or 'term'}: found a parameter {shape} that the optimizer does not hold"
                 )
             by_parameter[id(term.parameter)].append(term)
+        plans: list[_Plan] = []
+        found: list[tuple[Sequence[LocalTerm], list[float]]] = []
         for group in self.param_groups:
             for p in group["params"]:
                 terms = by_parameter.get(id(p), [])
-                for term, value in zip(terms, self._step_one(p, group, terms), strict=True):
-                    values[term.name] += value
+                step = self._step_one(p, group, terms)
+                if isinstance(step, list):
+                    found.append((terms, step))
+                elif step.job.flat:
+                    plans.append(step)
+                else:
+                    found.append((terms, step.finish(update(step.job, step.shape))))
+        # Together, as most parameters are small.
+        sums = update_flat([plan.job for plan in plans])
+        found += [(plan.terms, plan.finish(some)) for plan, some in zip(plans, sums, strict=True)]
+        for those, numbers in found:
+            for term, value in zip(those, numbers, strict=True):
+                values[term.name] += value
         return values
 
-    def _step_one(self, p: Tensor, group: dict[str, Any], terms: Sequence[LocalTerm]) -> list[float]:
+    def _step_one(self, p: Tensor, group: dict[str, Any], terms: Sequence[LocalTerm]) -> list[float] | _Plan:
+        """Values of the terms, or what is still to be done by the kernel."""
         if p.grad is None:
             if not terms and p not in self.state:
                 return []
@@ -221,7 +258,7 @@ class FusedAdam(torch.optim.Optimizer):
         coupled = 0.0 if decoupled else decay
         tensors = (p, p.grad, state["exp_avg"], state["exp_avg_sq"])
         if takes_compiled(*tensors) and all(x.is_contiguous() for x in tensors) and p.numel():
-            return _step_compiled(*tensors, moments, coupled, terms)
+            return _plan(*tensors, moments, coupled, terms)
         values = [_add_plainly(term, p.grad) for term in terms]
         if coupled:
             p.grad.add_(p, alpha=coupled)

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
-from typing import Any
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from backbones.kernels.adam_layout import Layout, Moments, Neighbours, Terms
-from backbones.kernels.compiler import float32, inline, integer, kernel, matrix, next_task, vector
+from backbones.kernels.compiler import float32, inline, int64, integer, kernel, matrix, next_task, vector
 from backbones.kernels.simd import LANES, load, one, store, total, wide
 from backbones.kernels.simd_math import divide, flush, magnitude, sign, square_root
 from backbones.kernels.threading import launch
 
-__all__ = ["update"]
+__all__ = ["Job", "update", "update_flat"]
 
 # Elements worked on at a time: all that one piece reads and writes stays in the first-level cache.
 _PIECE = 1024
@@ -71,22 +72,25 @@ def _factors(x: Any) -> Terms:
 
 @kernel
 def _flat(table: Any) -> None:
-    """p, g, m, v, constants, sums ``(tasks, 5)``."""
-    p, g, m, v = (
-        vector(table, 0, float32),
-        vector(table, 1, float32),
-        vector(table, 2, float32),
-        vector(table, 3, float32),
-    )
-    numbers, sums = vector(table, 4, float32), matrix(table, 5, np.float64)
-    s, k = _constants(numbers), _factors(numbers)
-    skips = k.sign == _ZERO and k.value == _ZERO and s.keep == _ONE
+    """Constants ``(jobs, 12)``, job and first element of each task ``(tasks, 2)``, sums ``(tasks, 5)``; then of each
+    job p, g, m, v."""
+    numbers, parts, sums = matrix(table, 0, float32), matrix(table, 1, int64), matrix(table, 2, np.float64)
     while True:
         task = next_task(table)
         if task < 0:
             break
-        end = min((task + 1) * _FLAT, p.shape[0])
-        for first in range(task * _FLAT, end, _PIECE):
+        job, begin = parts[task, 0], parts[task, 1]
+        place = 3 + 4 * job
+        p, g, m, v = (
+            vector(table, place, float32),
+            vector(table, place + 1, float32),
+            vector(table, place + 2, float32),
+            vector(table, place + 3, float32),
+        )
+        s, k = _constants(numbers[job]), _factors(numbers[job])
+        skips = k.sign == _ZERO and k.value == _ZERO and s.keep == _ONE
+        end = min(begin + _FLAT, p.shape[0])
+        for first in range(begin, end, _PIECE):
             last = min(first + _PIECE, end)
             if skips and m[first] == _ZERO and _idle(g, m, v, first, last):
                 continue
@@ -253,34 +257,60 @@ def _grid(table: Any) -> None:
                     )
 
 
-@lru_cache(maxsize=32)
-def _numbers(values: tuple[float, ...]) -> Tensor:
-    """As a tensor: most parameters of an iteration share theirs."""
-    return torch.tensor(values, dtype=torch.float32)
-
-
-def update(
-    p: Tensor, g: Tensor, m: Tensor, v: Tensor, moments: Moments, terms: Terms, shape: Layout
-) -> Tensor:
-    """One Adam step on ``p``, in place, with moments ``m`` and ``v``; adds the local gradients to ``g``, and
-    then clears it.
+class Job(NamedTuple):
+    """One parameter's step.
 
     Args:
-        p, g, m, v: contiguous float32 CPU tensors of one size.
+        p, g, m, v: parameter, gradient and both moments; contiguous float32 CPU tensors of one size.
         moments, terms: constants of the step.
+    """
+
+    p: Tensor
+    g: Tensor
+    m: Tensor
+    v: Tensor
+    moments: Moments
+    terms: Terms
+
+    @property
+    def flat(self) -> bool:
+        """Whether no term looks at neighbours."""
+        return not (self.terms.slabs or self.terms.rows or self.terms.nodes)
+
+    @property
+    def tensors(self) -> list[Tensor]:
+        """As vectors."""
+        return [self.p.detach().view(-1), self.g.view(-1), self.m.view(-1), self.v.view(-1)]
+
+
+def update_flat(jobs: Sequence[Job]) -> list[Tensor]:
+    """`update` of several parameters at once, for jobs that are flat."""
+    parts, tensors, ends = [], [], [0]
+    for number, job in enumerate(jobs):
+        parts += [(number, first) for first in range(0, job.p.numel(), _FLAT)]
+        ends.append(len(parts))
+        tensors += job.tensors
+    numbers = torch.tensor([(*job.moments, *job.terms) for job in jobs], dtype=torch.float32)
+    sums = torch.zeros(len(parts), 5, dtype=torch.float64)
+    launch(_flat, len(parts), numbers, torch.tensor(parts), sums, *tensors)
+    return [sums[first:last] for first, last in pairwise(ends)]
+
+
+def update(job: Job, shape: Layout) -> Tensor:
+    """One Adam step on ``p``, in place; adds the local gradients to ``g``, and then clears it.
+
+    Args:
+        job: tensors and constants.
         shape: of the tensors, from `layout`.
 
     Returns:
-        ``(5,)`` float64: of the parameters before the step, the sums of squared forward differences along
-        slabs, rows and nodes, of absolute values and of squares; 0 for those whose factor in ``terms`` is 0.
+        ``(parts, 5)`` float64: of the parameters before the step, the sums of squared forward differences along slabs,
+        rows and nodes, of absolute values and of squares, by parts; 0 for those whose factor in ``terms`` is 0.
     """
-    constants = _numbers((*moments, *terms))
-    tensors = [x.view(-1) for x in (p.detach(), g, m, v)]
-    if not (terms.slabs or terms.rows or terms.nodes):
-        tasks = -(-p.numel() // _FLAT)
-        sums = torch.zeros(tasks, 5, dtype=torch.float64)
-        launch(_flat, tasks, *tensors, constants, sums)
-        return sums.sum(0)
+    if job.flat:
+        return update_flat([job])[0]
+    constants = torch.tensor((*job.moments, *job.terms), dtype=torch.float32)
+    tensors = job.tensors
     block = -(-shape.slabs // _BLOCKS)
     blocks = -(-shape.slabs // block)
     slabs = tensors[0].view(shape.outer, shape.slabs, -1)
@@ -291,4 +321,4 @@ def update(
     )
     sums = torch.zeros(shape.outer * blocks, 5, dtype=torch.float64)
     launch(_grid, len(sums), *tensors, constants, sums, before, after, *shape[1:], block)
-    return sums.sum(0)
+    return sums

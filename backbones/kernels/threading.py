@@ -124,7 +124,7 @@ def pack(tasks: int, arguments: tuple[Tensor | int | float, ...]) -> Any:
     for place, value in enumerate(arguments):
         if isinstance(value, Tensor):
             shape = value.shape
-            if not value.is_contiguous() or value.device.type != "cpu" or len(shape) > 3:
+            if not (value.is_contiguous() and value.is_cpu) or len(shape) > 3:
                 raise ValueError(
                     f"argument {place}: found {value.device} tensor {tuple(value.shape)} with strides "
                     f"{value.stride()}, expected a contiguous CPU tensor of at most 3 axes"

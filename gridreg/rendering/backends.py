@@ -122,7 +122,7 @@ class use_backend:
 
 def takes_compiled(*tensors: Tensor) -> bool:
     """Whether the choice allows compiled code for these tensors: all on the CPU, all float32."""
-    return _choice != "torch" and all(x.device.type == "cpu" and x.dtype == torch.float32 for x in tensors)
+    return _choice != "torch" and all(x.is_cpu and x.dtype == torch.float32 for x in tensors)
 
 
 def _backend(*tensors: Tensor) -> Backend:
