@@ -31,7 +31,7 @@ from backbones.kernels.encode import MOST_OCTAVES, encode, encode_together
 from backbones.kernels.linear import Layer, Precision, check_layers, check_precision, mlp, product_dtype
 from backbones.kernels.octaves import read_octaves, write_octaves
 from backbones.kernels.perceptron import Block, fits, perceptron
-from backbones.kernels.simd import LANES, one, wide
+from backbones.kernels.simd import LANES, load, one, wide
 from backbones.kernels.threading import launch
 from gridreg.errors import InputError
 from gridreg.rendering.backends import takes_compiled
@@ -56,9 +56,10 @@ def _write(table: Any) -> None:
         for n in range(task * _ROWS, min((task + 1) * _ROWS, x.shape[0])):
             xs, ss, cs, row = x[n], s[n], c[n], out[n]
             for i in range(0, split, LANES):
-                write_octaves(xs, ss, cs, i, row, at + i, dims, octaves, wide(), store_low)
+                value, sine, cosine = load(xs, i, wide()), load(ss, i, wide()), load(cs, i, wide())
+                write_octaves(value, sine, cosine, row, at + i, dims, octaves, store_low)
             for i in range(split, dims):
-                write_octaves(xs, ss, cs, i, row, at + i, dims, octaves, one(), store_low)
+                write_octaves(xs[i], ss[i], cs[i], row, at + i, dims, octaves, store_low)
 
 
 @kernel

@@ -6,21 +6,20 @@ from typing import Any
 
 from backbones.kernels.bfloat16 import load_low
 from backbones.kernels.compiler import float32, inline
-from backbones.kernels.simd import load, store
+from backbones.kernels.simd import store
 
 __all__ = ["read_octaves", "write_octaves"]
 
 
 @inline
 def write_octaves(
-    x: Any, s: Any, c: Any, i: Any, out: Any, to: Any, dims: Any, octaves: Any, like: Any, write: Any
+    x: Any, sine: Any, cosine: Any, out: Any, to: Any, dims: Any, octaves: Any, write: Any
 ) -> None:
-    """Write all octaves of elements ``i`` on; ``sin 2a = 2 sin a cos a``, ``cos 2a = 1 - 2 sin^2 a``.
+    """Write all octaves of some elements of a row; ``sin 2a = 2 sin a cos a``, ``cos 2a = 1 - 2 sin^2 a``.
 
     ``write`` is `store_low`, or what does the same.
     """
-    sine, cosine = load(s, i, like), load(c, i, like)
-    write(out, to, load(x, i, like))
+    write(out, to, x)
     for octave in range(octaves):
         place = to + (1 + 2 * octave) * dims
         write(out, place, sine)

@@ -53,16 +53,17 @@ from backbones.kernels.dot_blocks import (
 )
 from backbones.kernels.dots import pack
 from backbones.kernels.octaves import read_octaves, write_octaves
-from backbones.kernels.simd import LANES, one, wide
+from backbones.kernels.simd import LANES, load, one, wide
 from backbones.kernels.sums import fold
 from backbones.kernels.threading import launch
+from backbones.kernels.waves import sine_and_cosine
 from backbones.kernels.workspace import room
 
 __all__ = ["Block", "fits", "gradients", "perceptron"]
 
 # Arguments of a kernel before those of the blocks, and of each block and layer.
 _AHEAD, _BACK = 5, 8
-_OF_BLOCK, _OF_LAYER = 6, 3
+_OF_BLOCK, _OF_LAYER = 4, 3
 _TILE = SUMMED * WIDEST
 
 
@@ -91,22 +92,18 @@ def _encode(table: Any, blocks: Any, first: Any, count: Any, encoded: Any, width
     at = int64(0)
     for block in range(blocks):
         place = _AHEAD + _OF_BLOCK * block
-        x, s, c = (
-            vector(table, place, float32),
-            vector(table, place + 1, float32),
-            vector(table, place + 2, float32),
-        )
-        rows, dims, octaves = (
-            vector(table, place + 3, int64),
-            integer(table, place + 4),
-            integer(table, place + 5),
-        )
+        x, rows = vector(table, place, float32), vector(table, place + 1, int64)
+        dims, octaves = integer(table, place + 2), integer(table, place + 3)
         by_row = rows.shape[0] > 0
         for n in range(first, first + count):
             source, to = (rows[n] if by_row else n) * dims, n * width + at
             # From the last vector on, as what a vector is too wide belongs to places that are written later.
             for i in range((dims - 1) // LANES * LANES, -1, -LANES):
-                write_octaves(x, s, c, source + i, encoded, to + i, dims, octaves, wide(), lower)
+                value = load(x, source + i, wide())
+                sine, cosine = value, value
+                if octaves > 0:
+                    sine, cosine = sine_and_cosine(value)
+                write_octaves(value, sine, cosine, encoded, to + i, dims, octaves, lower)
         at += dims * (1 + 2 * octaves)
     for n in range(first, first + count):
         for i in range(n * width + at, (n + 1) * width):
@@ -115,7 +112,7 @@ def _encode(table: Any, blocks: Any, first: Any, count: Any, encoded: Any, width
 
 @kernel
 def _forward(table: Any) -> None:
-    """Rows, blocks, layers, encoded, out; of blocks x, sine, cosine, rows, dims, octaves; of layers packed weight,
+    """Rows, blocks, layers, encoded, out; of blocks x, rows, dims, octaves; of layers packed weight,
     bias, output."""
     rows, blocks, depth = integer(table, 0), integer(table, 1), integer(table, 2)
     encoded, out = vector(table, 3, uint16), vector(table, 4, float32)
@@ -173,7 +170,7 @@ def _decode(
 @kernel
 def _backward(table: Any) -> None:
     """Rows, blocks, layers, encoded, gradient of out, columns of the encodings' gradient, zeros, sums ``(tasks, S)``;
-    of blocks result, first column, dims, octaves and two more; of layers packed transposed weight, input, place of its
+    of blocks result, first column, dims, octaves; of layers packed transposed weight, input, place of its
     sum."""
     rows, blocks, depth = integer(table, 0), integer(table, 1), integer(table, 2)
     encoded, gradient = vector(table, 3, uint16), vector(table, 4, float32)
@@ -229,16 +226,12 @@ def fits(blocks: Sequence[Block], layers: Sequence[Any]) -> bool:
     return widest <= WIDEST and available()
 
 
-def _waves(block: Block) -> tuple[Tensor, Tensor, Tensor]:
-    """x, sine and cosine, with room behind them for a whole vector to be read."""
-    count = block.x.numel()
-    room_ = torch.zeros(3 if block.octaves else 1, count + LANES)
-    room_[0, :count] = block.x.detach().reshape(-1)
-    if not block.octaves:
-        return room_[0], room_[0], room_[0]
-    torch.sin(room_[0, :count], out=room_[1, :count])
-    torch.cos(room_[0, :count], out=room_[2, :count])
-    return room_[0], room_[1], room_[2]
+def _padded(x: Tensor) -> Tensor:
+    """All elements, with room behind them for a whole vector to be read."""
+    count = x.numel()
+    found = torch.empty(count + LANES)
+    found[:count] = x.detach().reshape(-1)
+    return found
 
 
 def gradients(
@@ -263,7 +256,7 @@ def gradients(
     end = columns = 0
     for (dims, octaves, width), need in zip(blocks, wanted, strict=True):
         results.append(torch.empty(count, dims) if need else None)
-        arguments += [results[-1] if need else none, end, dims, octaves, 0, 0]
+        arguments += [results[-1] if need else none, end, dims, octaves]
         end += width
         columns = end if need else columns
     place, places = 0, []
@@ -295,7 +288,7 @@ class _Perceptron(Function):
         arguments: list[Any] = []
         for block in blocks:
             rows = none if block.rows is None else block.rows.contiguous()
-            arguments += [*_waves(block), rows, block.x.shape[1], block.octaves]
+            arguments += [_padded(block.x), rows, block.x.shape[1], block.octaves]
         inputs, weights = [encoded], []
         for place in range(0, len(flat), 2):
             weight, bias = flat[place], flat[place + 1]
