@@ -12,7 +12,7 @@ from torch import Tensor
 
 from backbones.kernels import cp, vm, vm_gradient
 from backbones.kernels.activation import Activation, March
-from backbones.kernels.march import march as _march
+from backbones.kernels.march import mark
 from backbones.kernels.simd import LANES
 from backbones.kernels.sums import thin
 from backbones.kernels.walk import walk
@@ -155,7 +155,7 @@ def march_density(
     lines, read = _opened(lines, open_channels)
     grids = (*planes, *lines)
     found = walk(
-        _march(*march),
+        mark(*march),
         *_parts(grids),
         read=read,
         activation=activation,

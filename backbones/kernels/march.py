@@ -15,6 +15,7 @@ from backbones.kernels.compiler import (
     cube,
     exact,
     float32,
+    inline,
     int64,
     kernel,
     matrix,
@@ -26,7 +27,7 @@ from backbones.kernels.compiler import (
 from backbones.kernels.threading import launch
 from gridreg.rendering.plain import CELL_TOLERANCE, steps_bound
 
-__all__ = ["Marked", "mark", "march"]
+__all__ = ["Marked", "distance_of", "mark", "march", "next_bit", "sample_at"]
 
 # Edge, in cells, of the blocks that are skipped whole when nothing in them is occupied.
 _COARSE = np.uint32(4)
@@ -154,26 +155,37 @@ def _mark(table: Any) -> None:
 
 
 @exact
-def _fill_ray(
-    o: Any, d: Any, near: Any, shift: Any, step: Any, bits: Any, index: Any, t: Any, x: Any
-) -> None:
-    """Write out the samples of one ray."""
-    n = 0
-    for word in range(bits.shape[0]):
+def sample_at(o: Any, d: Any, axis: Any, distance: Any) -> Any:
+    """Coordinate of a sample along an axis."""
+    return o[axis] + distance * d[axis]
+
+
+@exact
+def distance_of(near: Any, shift: Any, step: Any, index: Any) -> Any:
+    """Distance of sample ``index`` along its ray."""
+    return near + (np.float32(index) + shift) * step
+
+
+@inline
+def next_bit(bits: Any, after: Any) -> Any:
+    """The first index from ``after`` on whose bit is set; 64 for each word if there is none."""
+    words = bits.shape[0]
+    word = after >> 6
+    rest = int64(0)
+    if word < words:
+        # The sign bit would be shifted in for ever.
+        low = after & 63
+        rest = bits[word] if low == 0 else (bits[word] >> low) & (_REST >> (low - 1))
+    while rest == 0:
+        word += 1
+        if word >= words:
+            return 64 * words
+        after = 64 * word
         rest = bits[word]
-        i = word * 64
-        while rest != 0:
-            if rest & 1:
-                distance = near + (np.float32(i) + shift) * step
-                index[n] = i
-                t[n] = distance
-                x[n, 0] = o[0] + distance * d[0]
-                x[n, 1] = o[1] + distance * d[1]
-                x[n, 2] = o[2] + distance * d[2]
-                n += 1
-            # The sign bit would be shifted in for ever.
-            rest = (rest >> 1) & _REST
-            i += 1
+    while rest & 1 == 0:
+        rest = (rest >> 1) & _REST
+        after += 1
+    return after
 
 
 @kernel
@@ -188,19 +200,12 @@ def _fill(table: Any) -> None:
         if task < 0:
             break
         for ray in range(task * _RAYS, min((task + 1) * _RAYS, o.shape[0])):
-            first, end = offsets[ray], offsets[ray + 1]
-            if first < end:
-                _fill_ray(
-                    o[ray],
-                    d[ray],
-                    near[ray],
-                    shift[ray],
-                    step,
-                    bits[ray],
-                    index[first:end],
-                    t[first:end],
-                    x[first:end],
-                )
+            i = int64(-1)
+            for n in range(offsets[ray], offsets[ray + 1]):
+                i = next_bit(bits[ray], i + 1)
+                index[n], t[n] = i, distance_of(near[ray], shift[ray], step, i)
+                for axis in range(3):
+                    x[n, axis] = sample_at(o[ray], d[ray], axis, t[n])
 
 
 class Marked(NamedTuple):

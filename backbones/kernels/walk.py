@@ -22,6 +22,7 @@ from backbones.kernels.compiler import (
     int64,
     integer,
     kernel,
+    matrix,
     next_task,
     real,
     scratch,
@@ -29,6 +30,7 @@ from backbones.kernels.compiler import (
     vector,
 )
 from backbones.kernels.cp import product_sum
+from backbones.kernels.march import Marked, distance_of, next_bit, sample_at
 from backbones.kernels.places import BATCH, PLACES, find
 from backbones.kernels.simd import LANES, load, store, wide
 from backbones.kernels.softplus import softplus
@@ -41,6 +43,7 @@ __all__ = ["Walked", "walk"]
 _GROUP = LANES
 # Samples placed on the grid at a time, of which most may be in vain.
 _SPAN = 64
+_COORDINATES = 3 * _SPAN
 # Rays of a task.
 _RAYS = 16
 
@@ -68,18 +71,15 @@ class Walked:
 
 # Rounded as the plain version does it, so that both agree on what is inside.
 @exact
-def _normalise(x: Any, box: Any, first: Any, last: Any, u: Any) -> Any:
-    for axis in range(3):
-        lower, edge = box[axis], box[3 + axis] - box[axis]
-        for n in range(first, last):
-            u[3 * n + axis] = (x[3 * n + axis] - lower) / edge
+def _normalised(x: Any, box: Any, axis: Any) -> Any:
+    return (x - box[axis]) / (box[3 + axis] - box[axis])
 
 
 @inline
 def _cp_feature(table: Any, places: Any, q: Any, channels: Any, read: Any) -> Any:
     """Sum over channels at sample ``q`` of a batch."""
     nodes, shares = places
-    lines = vector(table, 10, float32), vector(table, 9, float32), vector(table, 8, float32)
+    lines = vector(table, 13, float32), vector(table, 12, float32), vector(table, 11, float32)
     x, y, z = int64(nodes[q]), int64(nodes[BATCH + q]), int64(nodes[2 * BATCH + q])
     between = shares[q], shares[BATCH + q], shares[2 * BATCH + q]
     return product_sum(lines, (x * channels, y * channels, z * channels), between, channels, read)
@@ -99,35 +99,40 @@ def _outside(u: Any, n: Any) -> Any:
 
 
 @inline
-def _walk_ray(table: Any, begin: Any, end: Any, places: Any, cells: Any, features: Any, planar: Any) -> Any:
-    """Fill u and density of the samples of a ray until it is opaque, and return how many can be seen."""
-    x, box, u, density = (
-        vector(table, 0, float32),
-        vector(table, 2, float32),
-        vector(table, 3, float32),
-        vector(table, 4, float32),
-    )
-    read, shift, scale, step, limit = (
-        integer(table, 11),
-        real(table, 12),
-        real(table, 13),
-        real(table, 14),
-        real(table, 15),
-    )
-    channels = size(table, 8, 1)
-    shape = size(table, 10, 0), size(table, 9, 0), size(table, 8, 0)
-    depth = float32(0)
+def _place(table: Any, ray: Any, i: Any, count: Any, u: Any) -> Any:
+    """Find the next samples of a ray behind index ``i``, normalise them to u, and return the last one's index."""
+    o, d = matrix(table, 0, float32), matrix(table, 1, float32)
+    near, shift, bits = vector(table, 2, float32), vector(table, 3, float32), matrix(table, 4, int64)
+    box, step = vector(table, 6, float32), real(table, 17)
+    for q in range(count):
+        i = next_bit(bits[ray], i + 1)
+        distance = distance_of(near[ray], shift[ray], step, i)
+        for axis in range(3):
+            u[3 * q + axis] = _normalised(sample_at(o[ray], d[ray], axis, distance), box, axis)
+    return i
+
+
+@inline
+def _walk_ray(table: Any, ray: Any, u: Any, places: Any, cells: Any, features: Any, planar: Any) -> Any:
+    """Fill density of the samples of a ray until it is opaque, and return how many can be seen."""
+    offsets, density = vector(table, 5, int64), vector(table, 7, float32)
+    read, shift, scale = integer(table, 14), real(table, 15), real(table, 16)
+    step, limit = real(table, 17), real(table, 18)
+    channels = size(table, 11, 1)
+    shape = size(table, 13, 0), size(table, 12, 0), size(table, 11, 0)
+    begin, end = offsets[ray], offsets[ray + 1]
+    depth, index = float32(0), int64(-1)
     for first in range(begin, end, _SPAN):
         count = min(int64(_SPAN), end - first)
-        _normalise(x, box, first, first + count, u)
-        find(places, u, first, count, shape)
+        index = _place(table, ray, index, count, u)
+        find(places, u, 0, count, shape)
         if planar:
             find_cells(cells, places[0], count, shape, channels)
         for start in range(0, count, _GROUP):
             stop = min(start + _GROUP, count)
             if planar:
                 for k in range(3):
-                    grids = vector(table, 5 + k, float32), vector(table, 8 + k, float32)
+                    grids = vector(table, 8 + k, float32), vector(table, 11 + k, float32)
                     look_up(
                         grids,
                         k,
@@ -150,7 +155,7 @@ def _walk_ray(table: Any, begin: Any, end: Any, places: Any, cells: Any, feature
             for q in range(start, stop):
                 if depth > limit:
                     return first + q - begin
-                value = float32(0) if _outside(u, first + q) else features[q]
+                value = float32(0) if _outside(u, q) else features[q]
                 density[first + q] = value
                 depth += value * step
     return end - begin
@@ -158,20 +163,21 @@ def _walk_ray(table: Any, begin: Any, end: Any, places: Any, cells: Any, feature
 
 @inline
 def _walk(table: Any, planar: Any) -> Any:
-    offsets, counts = vector(table, 1, int64), vector(table, 16, int64)
-    places = scratch(PLACES, int32), scratch(PLACES, float32)
+    counts = vector(table, 19, int64)
+    u, places = scratch(_COORDINATES, float32), (scratch(PLACES, int32), scratch(PLACES, float32))
     cells, features = scratch(PLACES, int32), scratch(BATCH, float32)
     while True:
         task = next_task(table)
         if task < 0:
             break
         for ray in range(task * _RAYS, min((task + 1) * _RAYS, counts.shape[0])):
-            counts[ray] = _walk_ray(table, offsets[ray], offsets[ray + 1], places, cells, features, planar)
+            counts[ray] = _walk_ray(table, ray, u, places, cells, features, planar)
 
 
 @kernel
 def _vm_walk(table: Any) -> None:
-    """positions, offsets, box, u, density, planes, lines, channels to read, shift, scale, step, limit, counts."""
+    """origins, directions, near, shift, bits, offsets, box, density, planes, lines, channels to read, shift, scale,
+    step, limit, counts."""
     _walk(table, True)
 
 
@@ -182,38 +188,43 @@ def _cp_walk(table: Any) -> None:
 
 
 @kernel
-def _pack(table: Any) -> None:
-    """Old offsets, new offsets, then index, t, positions, u, density, from and to."""
-    old, new = vector(table, 0, int64), vector(table, 1, int64)
-    index, t, x = vector(table, 2, int64), vector(table, 3, float32), vector(table, 4, float32)
-    u, density = vector(table, 5, float32), vector(table, 6, float32)
-    to_index, to_t, to_x = vector(table, 7, int64), vector(table, 8, float32), vector(table, 9, float32)
-    to_u, to_density = vector(table, 10, float32), vector(table, 11, float32)
+def _write(table: Any) -> None:
+    """The first six as of `_vm_walk`, then new offsets, box, density, step; index, t, positions, u,
+    density."""
+    o, d = matrix(table, 0, float32), matrix(table, 1, float32)
+    near, shift, bits = vector(table, 2, float32), vector(table, 3, float32), matrix(table, 4, int64)
+    old, new = vector(table, 5, int64), vector(table, 6, int64)
+    box, density, step = vector(table, 7, float32), vector(table, 8, float32), real(table, 9)
+    index, t, x = vector(table, 10, int64), vector(table, 11, float32), vector(table, 12, float32)
+    u, to_density = vector(table, 13, float32), vector(table, 14, float32)
     while True:
         task = next_task(table)
         if task < 0:
             break
         for ray in range(task * _RAYS, min((task + 1) * _RAYS, old.shape[0] - 1)):
-            start = old[ray] - new[ray]
+            start, i = old[ray] - new[ray], int64(-1)
             for n in range(new[ray], new[ray + 1]):
-                to_index[n], to_t[n], to_density[n] = index[n + start], t[n + start], density[n + start]
-            start *= 3
-            for n in range(3 * new[ray], 3 * new[ray + 1]):
-                to_x[n], to_u[n] = x[n + start], u[n + start]
+                i = next_bit(bits[ray], i + 1)
+                distance = distance_of(near[ray], shift[ray], step, i)
+                index[n], t[n], to_density[n] = i, distance, density[n + start]
+                for axis in range(3):
+                    coordinate = sample_at(o[ray], d[ray], axis, distance)
+                    x[3 * n + axis] = coordinate
+                    u[3 * n + axis] = _normalised(coordinate, box, axis)
 
 
 def walk(
-    marched: tuple[Tensor, Tensor, Tensor, Tensor],
+    marked: Marked,
     *grids: Sequence[Tensor],
     read: int,
     activation: Activation,
     step: float,
     transmittance_bound: float,
 ) -> Walked:
-    """Density at marched samples up to where a ray is opaque.
+    """Density at the samples of a march up to where a ray is opaque.
 
     Args:
-        marched: offsets, index, t and positions, as `backbones.kernels.march.march` returns them.
+        marked: the samples, as `backbones.kernels.march.mark` returns them.
         grids: three planes, unless the grid is a CP grid, and three lines.
         read: number of channels to use.
         activation: from features to densities.
@@ -221,28 +232,24 @@ def walk(
         transmittance_bound: samples behind a smaller transmittance are dropped.
     """
     planar, lines = len(grids) > 1, grids[-1]
-    offsets, index, t, positions = marched
-    rays, samples = offsets.shape[0] - 1, positions.shape[0]
-    tasks = -(-rays // _RAYS)
-    u, density = torch.empty(samples, 3), torch.empty(samples)
-    counts = torch.empty(rays, dtype=torch.int64)
+    rays, samples = len(marked.offsets) - 1, int(marked.offsets[-1])
+    tasks, box = -(-rays // _RAYS) if samples else 0, activation.bounds.contiguous()
+    density, counts = torch.empty(samples), torch.zeros(rays, dtype=torch.int64)
     limit = -math.log(transmittance_bound) if transmittance_bound > 0 else math.inf
     # A CP grid gives its lines once more in place of planes, which are not read then.
     launch(
-        _vm_walk if planar else _cp_walk, tasks, positions, offsets, activation.bounds.contiguous(), u, density,
-        *grids[0], *lines, read, float(activation.shift), float(activation.scale), float(step), limit, counts,
+        _vm_walk if planar else _cp_walk, tasks, *marked, box, density, *grids[0], *lines, read,
+        float(activation.shift), float(activation.scale), float(step), limit, counts,
     )  # fmt: skip
-    seen = torch.zeros_like(offsets)
+    seen = torch.zeros_like(marked.offsets)
     torch.cumsum(counts, 0, out=seen[1:])
     kept = int(seen[-1])
-    if kept == samples:
-        return Walked(offsets, index, t, positions, u, density)
-    packed = (
+    found = (
         torch.empty(kept, dtype=torch.int64),
         torch.empty(kept),
         torch.empty(kept, 3),
         torch.empty(kept, 3),
         torch.empty(kept),
     )
-    launch(_pack, tasks if kept else 0, offsets, seen, index, t, positions, u, density, *packed)
-    return Walked(seen, *packed)
+    launch(_write, tasks if kept else 0, *marked, seen, box, density, float(step), *found)
+    return Walked(seen, *found)

@@ -111,7 +111,7 @@ def places_of(trainer: Trainer) -> list[Place]:
         Place(render, "box_intersection", "rays"),
         Place(backends, "march", "march"),
         Place(plain, "march", "march"),
-        Place(autograd, "_march", "march"),
+        Place(autograd, "mark", "march"),
         Place(field, _first(field, "march_density", "density"), "density"),
         Place(field, _first(field, "colour_of_rays", "colour"), "colour/network"),
         Place(kernels, "vm_features", "colour/lookup"),
