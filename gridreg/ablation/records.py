@@ -13,7 +13,7 @@ from gridreg.errors import InputError
 
 __all__ = ["NUMERICS_VERSION", "STATUSES", "RunResult", "RunSpec", "Status", "Study"]
 
-NUMERICS_VERSION = 3
+NUMERICS_VERSION = 4
 """Raised by one whenever the same configuration gives other numbers, so that stored results are not mixed."""
 
 Status = Literal["waiting", "running", "done", "failed"]
