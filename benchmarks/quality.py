@@ -21,11 +21,21 @@ sys.path.insert(0, str(Path(__file__).parent))
 from speed.whole_run import Spans
 
 from gridreg.cli import ending
-from gridreg.training import configure, execute, open_scene
+from gridreg.rendering.backends import use_backend
+from gridreg.training import StepReport, configure, execute, open_scene
 from gridreg.training.files import write_json
 from gridreg.training.options import TrainOptions
 
 RESULTS = Path(__file__).parent / "results" / "quality"
+
+
+class Trained(Spans):
+    """Leaves the plain path when training has ended: it would take minutes for a picture, and they are the same."""
+
+    def step(self, report: StepReport) -> None:
+        super().step(report)
+        if self.run.trainer.step == self.run.trainer.settings.steps:
+            use_backend("auto")
 
 
 def result_path(
@@ -62,7 +72,8 @@ def score(
     )
     config = configure(options)
     scene = open_scene(config, cache=Path(tempfile.gettempdir()))
-    spans = Spans(config.train)
+    spans = Trained(config.train)
+    use_backend(backend)
     with ExitStack() as stack:
         out = stack.enter_context(tempfile.TemporaryDirectory()) if keep is None else keep / target.stem
         _, metrics = execute(config, scene, out, watch=spans)
@@ -121,7 +132,9 @@ def main() -> int:
     parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="such as field.decoder=mlp")
     parser.add_argument("--protocol", default="dietnerf8")
     parser.add_argument("--threads", type=int)
-    parser.add_argument("--backend", choices=("auto", "torch"), default="auto")
+    parser.add_argument(
+        "--backend", choices=("auto", "torch"), default="auto", help="torch: train by the plain path"
+    )
     parser.add_argument(
         "--keep", type=Path, metavar="DIR", help="keep the output folders of the runs here, pictures included"
     )
@@ -134,10 +147,6 @@ def main() -> int:
         parser.error("--data: expected the folder that holds the scenes")
     if arguments.threads:
         torch.set_num_threads(arguments.threads)
-    if arguments.backend != "auto":
-        from gridreg.rendering.backends import use_backend
-
-        use_backend(arguments.backend)
     for seed in arguments.seeds:
         for scene in arguments.scenes:
             for run in arguments.runs:
