@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from backbones.kernels import composite
 from gridreg.errors import InputError
 from gridreg.scenes import builtin_scene
 
@@ -133,6 +134,22 @@ def test_memory(
     record, printed = run(["memory", *whole(scene, 3)], tmp_path / "r", capsys)
     assert record["steps"] == 3
     assert "| all modules imported |" in printed
+
+
+def test_compiling_is_counted(
+    scene: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(whole_run, "run_apart", whole_run.run_here)
+    # Read from the cache once more.
+    monkeypatch.setattr(composite._pixels_forward, "_compiled", None)
+    record, printed = run(["compile", *whole(scene, 3)], tmp_path / "r", capsys)
+    assert record["first"]["count"] >= 1
+    assert record["first"]["seconds"] > 0
+    assert record["later"] == {"count": 0, "seconds": 0.0}
+    assert "| later | 0 | 0.0 |" in printed
 
 
 def test_a_run_that_fails_says_why(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

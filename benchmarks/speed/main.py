@@ -10,7 +10,7 @@ from pathlib import Path
 
 import torch
 
-from . import common, frame, masks, memory, roofline, scaling, schedule, step, whole_run
+from . import common, compiling, frame, masks, memory, roofline, scaling, schedule, step, whole_run
 from .common import existing_folder
 
 COMMANDS = {
@@ -21,6 +21,7 @@ COMMANDS = {
     "masks": masks,
     "memory": memory,
     "roofline": roofline,
+    "compile": compiling,
 }
 
 

@@ -9,11 +9,13 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from backbones.kernels.compiler import Kernel
 from gridreg.errors import InputError
 from gridreg.rendering.backends import use_backend
 from gridreg.training import Execution, StepReport, TrainSettings, execute
@@ -21,6 +23,7 @@ from gridreg.training.files import write_json
 
 from . import common
 from .common import Record
+from .stopwatch import replaced
 
 PROGRAM = Path(__file__).parents[1] / "speed.py"
 
@@ -89,8 +92,12 @@ def run_here(arguments: argparse.Namespace) -> Record:
     config = common.configuration(arguments, arguments.steps)
     scene = common.scene_of(config)
     peaks["scene"] = peak_bytes()
-    spans = Spans(config.train)
-    with tempfile.TemporaryDirectory() as out, use_backend(arguments.backend):
+    spans, kernels = Spans(config.train), {"count": 0, "seconds": 0.0}
+    with (
+        tempfile.TemporaryDirectory() as out,
+        use_backend(arguments.backend),
+        replaced(Kernel, "_compile", _counted(Kernel._compile, kernels)),
+    ):
         _, metrics = execute(config, scene, out, watch=spans)
     if metrics is None:
         raise KeyboardInterrupt
@@ -107,7 +114,22 @@ def run_here(arguments: argparse.Namespace) -> Record:
         "test_views": len(metrics["images"]),
         "spans": spans.rows,
         "peak_bytes": peaks,
+        "kernels": kernels,
     }
+
+
+def _counted(function: Callable[[Kernel], Any], kernels: dict[str, Any]) -> Callable[[Kernel], Any]:
+    """The same, noting how often it was called and how long it took."""
+
+    def run(kernel: Kernel) -> Any:
+        began = time.perf_counter()
+        try:
+            return function(kernel)
+        finally:
+            kernels["count"] += 1
+            kernels["seconds"] += time.perf_counter() - began
+
+    return run
 
 
 def run_apart(arguments: argparse.Namespace) -> Record:
