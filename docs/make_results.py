@@ -294,6 +294,11 @@ scenes, so they are not part of the project.
 * lego, `best` (the same view, 29.4 dB): no fog and no haze. What is left: edges one pixel wide, the gaps of the
   tracks and of the grille, the inner wall of the bucket, a little soft. The worst views are the low ones from the
   side (24.6 dB) and the one from behind and above (24.1 dB).
+* chair, `tensorf` (r_152, 27.3 dB): closed, patterns readable, a little darker than it is. A green patch hangs above
+  the chair in views from behind and above (r_0, r_168 to r_192): the rest of a wall right before a training camera.
+* chair, `few_tensorf_finetuned` (the same view, 25.6 dB): no wall. White wood before the white background can be seen
+  through: legs, armrests and the rim below the seat are frayed, most in views from the side (r_64 to r_80, 21.7 to
+  22.6 dB). With an occlusion loss that counts 20 samples from the box, the front legs are eaten away as well.
 * chair, `best` (r_64, 26.0 dB; r_152, 30.1 dB): upright, closed, patterns readable. The ornaments are blurred where
   they sit on thin wood, the shadow side of the legs is hazy, the armrest's cloth has lost its pattern, and seat and
   back are a little too bright all over: their sheen is seen from one direction by one training view.
