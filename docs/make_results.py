@@ -33,7 +33,8 @@ that has not been made. Runs with one thread ran beside another one on the same 
 
 Published figures are those of the Few TensoRF paper, whose rows for TensoRF and FreeNeRF are its own reproductions. Its
 text does not say which eight views it used; its released configuration has those of `fewtensorf8`. Published baselines
-scatter by 1 to 2 dB between papers, so only rows of one program under one protocol compare.
+scatter by 1 to 2 dB between papers, so only rows of one program under one protocol compare. The occlusion loss of the
+fine-tuned row has FreeNeRF's range from the near plane, that of the raw one counts samples from the box.
 
 """
 
