@@ -186,6 +186,11 @@ STUDIES = (
         "near plane.",
     ),
     (
+        "finetuned_search",
+        "Changes to Few TensoRF, fine-tuned",
+        "One change at a time.",
+    ),
+    (
         "best_leave_one_out",
         "Pieces of `best`",
         "One piece left out at a time; what a negative figure says is lost without it.",
