@@ -244,7 +244,7 @@ def render_image(
     march: March,
     *,
     background: Tensor,
-    chunk: int = 1 << 12,
+    chunk: int = 1 << 13,
     warp: Callable[[Rays], Rays] | None = None,
 ) -> Rendered:
     """Render one picture; the result does not depend on ``chunk``.
