@@ -11,7 +11,7 @@ HELP = "peak memory of a run, by what it has done so far"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    whole_run.add_arguments(parser, preset="few_tensorf")
+    whole_run.add_arguments(parser, preset="quick")
     parser.add_argument(
         "--steps",
         type=common.count,
