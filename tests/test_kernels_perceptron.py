@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 from backbones.kernels import Block, dot_blocks, encoded, encoded_mlp
 from backbones.kernels.compiler import float32, kernel, next_task, uint16, vector
-from backbones.kernels.dot_blocks import lower
+from backbones.kernels.dot_blocks import HIGH, SUMMED, TASKS, lower
 from backbones.kernels.linear import Layer
-from backbones.kernels.perceptron import fits
+from backbones.kernels.perceptron import fits, rows_of
 from backbones.kernels.simd import LANES, load, wide
 from backbones.kernels.threading import launch
 
@@ -117,6 +117,17 @@ def test_numbers_do_not_depend_on_threads():
     for other in found[1:]:
         for a, b in zip(found[0], other, strict=True):
             assert torch.equal(a, b)
+
+
+def test_blocks_of_rows_end_within_what_is_there():
+    """Both passes read and write whole blocks of rows, and those of the backward pass begin anywhere."""
+    for count in range(1, 3000):
+        ends = [-(-count // HIGH) * HIGH]
+        for task in range(TASKS):
+            end = count * (task + 1) // TASKS
+            for first in range(count * task // TASKS, end, SUMMED):
+                ends.append(first + -(-min(SUMMED, end - first) // HIGH) * HIGH)
+        assert max(ends) <= rows_of(count)
 
 
 @native

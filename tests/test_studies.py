@@ -46,6 +46,17 @@ ROWS = {
         "dropout", "initial opacity 0.5", "half the step", "to 200 cubed", "cheaper iterations",
         "cheaper, mean of the last fifth",
     ],
+    "best_leave_one_out": [
+        "best", "no distortion", "no occlusion loss", "no L1", "no total variation", "no random background",
+        "no carving", "no mean of the last fifth", "slower learning as in TensoRF",
+    ],
+    "finetuned_search": [
+        "as it is", "no masks", "masks until 0.2", "masks on encodings alone", "total variation in every iteration",
+        "total variation 0.002",
+    ],
+    "occlusion_near": [
+        "none", "20 samples from the box", "0.625 from the near plane", "20 samples until the box shrinks",
+    ],
     "human_search": [
         "best", "total variation 0.01", "total variation 0.04", "no distortion", "24 components to 200 cubed",
     ],

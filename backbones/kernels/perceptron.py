@@ -59,7 +59,7 @@ from backbones.kernels.threading import launch
 from backbones.kernels.waves import sine_and_cosine
 from backbones.kernels.workspace import room
 
-__all__ = ["Block", "fits", "gradients", "perceptron"]
+__all__ = ["Block", "fits", "gradients", "perceptron", "rows_of"]
 
 # Arguments of a kernel before those of the blocks, and of each block and layer.
 _AHEAD, _BACK = 5, 8
@@ -215,6 +215,11 @@ def _up(count: int, to: int) -> int:
     return -(-count // to) * to
 
 
+def rows_of(count: int) -> int:
+    """Rows of what passes between layers: whole blocks, also from the first row of any task of the backward pass on."""
+    return _up(count, HIGH) + HIGH
+
+
 def _encoded_width(blocks: Sequence[Block]) -> int:
     """Columns of the encodings and zeros; the last vector that is written may reach beyond its block."""
     return _up(sum(block.width for block in blocks) + LANES - 1, 16)
@@ -284,7 +289,7 @@ class _Perceptron(Function):
     def forward(ctx: Any, blocks: list[Block], count: int, *tensors: Tensor | None) -> Tensor:
         flat = tensors[len(blocks) :]
         width, none = _encoded_width(blocks), torch.empty(0, dtype=torch.int64)
-        encoded = torch.empty(_up(count, HIGH), width, dtype=torch.bfloat16)
+        encoded = torch.empty(rows_of(count), width, dtype=torch.bfloat16)
         arguments: list[Any] = []
         for block in blocks:
             rows = none if block.rows is None else block.rows.contiguous()
