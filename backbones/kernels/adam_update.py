@@ -284,7 +284,7 @@ class Job(NamedTuple):
 
 
 def update_flat(jobs: Sequence[Job]) -> list[Tensor]:
-    """`update` of several parameters at once, for jobs that are flat."""
+    """`update` of several parameters at once; none of them has a term that looks at neighbours."""
     parts, tensors, ends = [], [], [0]
     for number, job in enumerate(jobs):
         parts += [(number, first) for first in range(0, job.p.numel(), _FLAT)]
@@ -300,15 +300,13 @@ def update(job: Job, shape: Layout) -> Tensor:
     """One Adam step on ``p``, in place; adds the local gradients to ``g``, and then clears it.
 
     Args:
-        job: tensors and constants.
+        job: tensors and constants; a term looks at neighbours.
         shape: of the tensors, from `layout`.
 
     Returns:
         ``(parts, 5)`` float64: of the parameters before the step, the sums of squared forward differences along slabs,
         rows and nodes, of absolute values and of squares, by parts; 0 for those whose factor in ``terms`` is 0.
     """
-    if job.flat:
-        return update_flat([job])[0]
     constants = torch.tensor((*job.moments, *job.terms), dtype=torch.float32)
     tensors = job.tensors
     block = -(-shape.slabs // _BLOCKS)

@@ -73,7 +73,7 @@ _REALS = ir.VectorType(ir.FloatType(), 16)
 _WORDS = ir.VectorType(_WORD, 16)
 _SHORTS = ir.VectorType(ir.IntType(16), 16)
 _LOW, _HALF = ir.VectorType(_BFloat(), 32), ir.VectorType(_BFloat(), 16)
-_DOT, _CONVERT = "llvm.x86.avx512bf16.dpbf16ps.512", "llvm.x86.avx512bf16.cvtneps2bf16.512"
+_DOT, _CONVERT = "llvm.x86.avx512bf16.dpbf16ps.512", "llvm.x86.avx512bf16.cvtneps2bf16"
 
 
 @functools.cache
@@ -94,9 +94,11 @@ def _vector(builder: Any, pointer: Any, index: Any, like: Any) -> Any:
 
 
 def _lowered(builder: Any, value: Any) -> Any:
-    """Sixteen float32 rounded to bfloat16."""
-    kind = ir.FunctionType(_HALF, [_REALS])
-    convert = cgutils.get_or_insert_function(builder.module, kind, _CONVERT)  # type: ignore[no-untyped-call]
+    """Eight or sixteen float32 rounded to bfloat16."""
+    lanes = value.type.count
+    kind = ir.FunctionType(ir.VectorType(_BFloat(), lanes), [value.type])
+    name = f"{_CONVERT}.{32 * lanes}"
+    convert = cgutils.get_or_insert_function(builder.module, kind, name)  # type: ignore[no-untyped-call]
     return builder.call(convert, [value])
 
 
@@ -228,11 +230,9 @@ def lower(context: Any, array: Any, index: Any, value: Any) -> Any:
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
-        eight, half = ir.VectorType(ir.FloatType(), 8), ir.VectorType(_BFloat(), 8)
-        kind = ir.FunctionType(half, [eight])
-        convert = cgutils.get_or_insert_function(builder.module, kind, _CONVERT.replace(".512", ".256"))  # type: ignore[no-untyped-call]
         index = context.cast(builder, arguments[1], signature.args[1], types.int64)
-        builder.store(builder.call(convert, [arguments[2]]), _vector(builder, data, index, half), align=2)
+        low = _lowered(builder, arguments[2])
+        builder.store(low, _vector(builder, data, index, low.type), align=2)
         return context.get_dummy_value()
 
     return types.void(array, index, value), generate

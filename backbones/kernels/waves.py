@@ -6,6 +6,7 @@ from typing import Any
 
 from llvmlite import ir  # type: ignore[import-untyped]
 from numba import types
+from numba.core import cgutils
 
 from backbones.kernels.compiler import intrinsic
 
@@ -38,8 +39,8 @@ def sine_and_cosine(context: Any, value: Any) -> Any:
             return constant(number, x.type)
 
         def function(symbol: str, count: int, result: Any) -> Any:
-            found = builder.module.globals.get(symbol)
-            return found or ir.Function(builder.module, ir.FunctionType(result, [x.type] * count), symbol)
+            kind = ir.FunctionType(result, [x.type] * count)
+            return cgutils.get_or_insert_function(builder.module, kind, symbol)  # type: ignore[no-untyped-call]
 
         def multiply_add(a: Any, b: Any, c: Any) -> Any:
             return builder.call(function(f"llvm.fma.{name}", 3, x.type), [a, b, c])

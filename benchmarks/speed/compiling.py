@@ -14,13 +14,7 @@ HELP = "seconds that a first run compiles, and that a later one reads what it le
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    whole_run.add_arguments(parser, preset="quick")
-    parser.add_argument(
-        "--steps",
-        type=common.count,
-        default=60,
-        help="iterations of the shortened schedule, in which all events happen; default: %(default)s",
-    )
+    whole_run.add_shortened_arguments(parser, steps=60)
 
 
 def measure(arguments: argparse.Namespace) -> tuple[Record, str]:

@@ -11,13 +11,7 @@ HELP = "peak memory of a run, by what it has done so far"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    whole_run.add_arguments(parser, preset="quick")
-    parser.add_argument(
-        "--steps",
-        type=common.count,
-        default=150,
-        help="iterations of the shortened schedule; default: %(default)s",
-    )
+    whole_run.add_shortened_arguments(parser, steps=150)
 
 
 def measure(arguments: argparse.Namespace) -> tuple[Record, str]:

@@ -86,6 +86,17 @@ def add_arguments(parser: argparse.ArgumentParser, preset: str) -> None:
     parser.add_argument("--backend", choices=("auto", "torch"), default="auto", help="torch: the plain path")
 
 
+def add_shortened_arguments(parser: argparse.ArgumentParser, steps: int) -> None:
+    """Of commands that need no more of a run than all of its events."""
+    add_arguments(parser, preset="quick")
+    parser.add_argument(
+        "--steps",
+        type=common.count,
+        default=steps,
+        help="iterations of the shortened schedule; default: %(default)s",
+    )
+
+
 def run_here(arguments: argparse.Namespace) -> Record:
     """Train and score in this process; figures by span of the schedule, scores and memory."""
     peaks = {"imports": peak_bytes()}
