@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd import Function
+from torch.autograd.function import once_differentiable
 
 from gridreg.base import Context, LocalTerm, Regularizer, check_site, check_weight, register
 from gridreg.errors import InputError
@@ -56,6 +59,23 @@ def l1(values: Tensor) -> Tensor:
     return values.abs().mean()
 
 
+class _Orthogonality(Function):
+    """In one piece, as lines are so small that what counts is the number of operations."""
+
+    @staticmethod
+    def forward(ctx: Any, lines: Tensor) -> Tensor:
+        products = (lines @ lines.T).fill_diagonal_(0)
+        ctx.save_for_backward(lines, products)
+        return products.abs().sum() / (len(lines) * (len(lines) - 1))
+
+    @staticmethod
+    @once_differentiable  # type: ignore[untyped-decorator]
+    def backward(ctx: Any, upstream: Tensor) -> Tensor:
+        lines, products = ctx.saved_tensors
+        gradient: Tensor = (products.sign() @ lines) * (2 * upstream / (len(lines) * (len(lines) - 1)))
+        return gradient
+
+
 def orthogonality(lines: Tensor) -> Tensor:
     """Mean absolute value of what lies off the diagonal of ``V V^T``: channels should not repeat each other.
 
@@ -63,17 +83,16 @@ def orthogonality(lines: Tensor) -> Tensor:
         lines: ``(R, M)``, one row for each of `R` channels.
 
     Returns:
-        Scalar; 0 for a single channel. Source: TensoRF's program, `vectorDiffs`.
+        Scalar; 0 for a single channel. Differentiable once. Source: TensoRF's program, `vectorDiffs`.
 
     Example:
         >>> orthogonality(torch.eye(3)).item(), orthogonality(torch.ones(2, 5)).item()
         (0.0, 5.0)
     """
-    count = lines.shape[0]
-    if count < 2:
+    if lines.shape[0] < 2:
         return lines.sum() * 0
-    products = (lines @ lines.T).abs()
-    return (products.sum() - products.diagonal().sum()) / (count * (count - 1))
+    value: Tensor = _Orthogonality.apply(lines)  # type: ignore[no-untyped-call]
+    return value
 
 
 def _spatial(grid: Grid, who: str) -> tuple[int, ...]:

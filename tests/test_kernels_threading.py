@@ -150,12 +150,12 @@ def test_kernels_of_other_versions_are_forgotten(tmp_path):
     stale, foreign = tmp_path / "vm._density-1.py311.nbi", tmp_path / "other.f-1.py311.nbi"
     for file in (stale, foreign):
         file.write_text("x")
-    compiler._forget_outdated(str(tmp_path))
+    assert compiler._forget_outdated(str(tmp_path))
     assert not stale.exists()
     assert foreign.exists()
     stale.write_text("fresh")
     compiler._forget_outdated.cache_clear()
-    compiler._forget_outdated(str(tmp_path))
+    assert not compiler._forget_outdated(str(tmp_path))
     assert stale.exists()
 
 
@@ -164,10 +164,10 @@ def test_one_process_compiles_while_others_wait(tmp_path):
     folder, order = str(tmp_path / "cache"), []
 
     def second():
-        with compiler._one_process(folder):
+        with compiler._one_process(folder, "vm._density"):
             order.append("second")
 
-    with compiler._one_process(folder):
+    with compiler._one_process(folder, "vm._density"):
         # A file opened anew has a lock of its own, as another process has.
         other = Thread(target=second)
         other.start()

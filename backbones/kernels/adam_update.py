@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -283,16 +284,23 @@ class Job(NamedTuple):
         return [self.p.detach().view(-1), self.g.view(-1), self.m.view(-1), self.v.view(-1)]
 
 
+@functools.lru_cache(maxsize=16)
+def _parts(sizes: tuple[int, ...]) -> tuple[Tensor, tuple[int, ...]]:
+    """``(P, 2)`` int64, number and first element of the parts of tensors, and where those of each begin and end."""
+    parts, ends = [], [0]
+    for number, size in enumerate(sizes):
+        parts += [(number, first) for first in range(0, size, _FLAT)]
+        ends.append(len(parts))
+    return torch.tensor(parts).view(-1, 2), tuple(ends)
+
+
 def update_flat(jobs: Sequence[Job]) -> list[Tensor]:
     """`update` of several parameters at once; none of them has a term that looks at neighbours."""
-    parts, tensors, ends = [], [], [0]
-    for number, job in enumerate(jobs):
-        parts += [(number, first) for first in range(0, job.p.numel(), _FLAT)]
-        ends.append(len(parts))
-        tensors += job.tensors
+    parts, ends = _parts(tuple(job.p.numel() for job in jobs))
+    tensors = [tensor for job in jobs for tensor in job.tensors]
     numbers = torch.tensor([(*job.moments, *job.terms) for job in jobs], dtype=torch.float32)
     sums = torch.zeros(len(parts), 5, dtype=torch.float64)
-    launch(_flat, len(parts), numbers, torch.tensor(parts), sums, *tensors)
+    launch(_flat, len(parts), numbers, parts, sums, *tensors)
     return [sums[first:last] for first, last in pairwise(ends)]
 
 

@@ -99,14 +99,34 @@ class Kernel:
                     self._compiled = self._compile()
         return int(self._compiled.address)
 
+    @property
+    def name(self) -> str:
+        """Of module and function, as its files in the cache begin."""
+        return f"{self.function.__module__.rpartition('.')[2]}.{self.function.__name__}"
+
+    @property
+    def _folder(self) -> str:
+        """Of the cache, which need not exist."""
+        cache = FunctionCache(self.function)  # type: ignore[no-untyped-call]
+        return str(cache.cache_path)
+
+    @property
+    def cached(self) -> bool:
+        """Whether a process has compiled the kernel, or is at it."""
+        folder = Path(self._folder)
+        return (folder / f"{self.name}.lock").exists()
+
     def _compile(self) -> Any:
         compiled: Any = functools.partial(cfunc, types.void(_TABLE), fastmath=_FAST, **_OPTIONS)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NumbaWarning)
             try:
-                cache = FunctionCache(self.function)  # type: ignore[no-untyped-call]
-                with _one_process(cache.cache_path):
-                    _forget_outdated(cache.cache_path)
+                folder = self._folder
+                with _one_process(folder, "gridreg-kernels"):
+                    empty = _forget_outdated(folder)
+                if empty and self.function.__module__.startswith(__package__):
+                    _compile_ahead()
+                with _one_process(folder, self.name):
                     return compiled(cache=True)(self.function)
             except (RuntimeError, OSError):
                 # No folder to keep a cache in: neither beside the source nor in the user's.
@@ -116,15 +136,23 @@ class Kernel:
 kernel = Kernel
 
 
+@functools.cache
+def _compile_ahead() -> None:
+    # Here, as that module uses this one.
+    from backbones.kernels import ahead
+
+    ahead.start()
+
+
 @contextmanager
-def _one_process(folder: str) -> Iterator[None]:
-    """While one process compiles, others wait, and then read what it has left in the cache.
+def _one_process(folder: str, name: str) -> Iterator[None]:
+    """While one process compiles a kernel, others wait, and then read what it has left in the cache.
 
     That spares the work; and code that two processes generate may differ in the order of its sums, so that their
     numbers would differ in the last digits. Where files cannot be locked, each process goes on alone.
     """
     Path(folder).mkdir(parents=True, exist_ok=True)
-    with (Path(folder) / "gridreg-kernels.lock").open("a") as lock:
+    with (Path(folder) / f"{name}.lock").open("a") as lock:
         if fcntl is not None:
             with contextlib.suppress(OSError):
                 fcntl.flock(lock, fcntl.LOCK_EX)
@@ -143,20 +171,22 @@ def _sources() -> tuple[tuple[str, ...], str]:
 
 
 @functools.cache
-def _forget_outdated(folder: str) -> None:
-    """Drop cached kernels of other versions of this package.
+def _forget_outdated(folder: str) -> bool:
+    """Drop cached kernels of other versions of this package; returns whether none are left.
 
     numba drops a kernel when the kernel's own file changes, not when a function that it calls does in another file.
     """
     names, digest = _sources()
     stamp = Path(folder) / "gridreg-kernels.sha256"
     if stamp.exists() and stamp.read_text() == digest:
-        return
+        return False
     Path(folder).mkdir(parents=True, exist_ok=True)
     for name in names:
-        for index in Path(folder).glob(f"{name}.*.nbi"):
-            index.unlink(missing_ok=True)
+        for kind in ("nbi", "lock"):
+            for file in Path(folder).glob(f"{name}.*.{kind}"):
+                file.unlink(missing_ok=True)
     stamp.write_text(digest)
+    return True
 
 
 def inline(function: Callable[..., Any]) -> Any:

@@ -1,0 +1,78 @@
+"""A second process compiles kernels from the other end: which ones, how far, and when there is none."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import subprocess
+import sys
+import textwrap
+
+import pytest
+
+from backbones.kernels import ahead
+from backbones.kernels.compiler import Kernel
+
+
+@pytest.mark.parametrize("name", ahead._ORDER)
+def test_what_it_names_is_a_kernel(name):
+    module, _, function = name.partition(".")
+    found = getattr(importlib.import_module(f"backbones.kernels.{module}"), function)
+    assert isinstance(found, Kernel)
+    assert found.name == name
+
+
+def in_fresh_cache(folder, text, **variables):
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(text)],
+        env={**os.environ, "NUMBA_CACHE_DIR": str(folder), **variables},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return sorted(file.name.rpartition("-")[0] for file in folder.glob("*/*.nbi"))
+
+
+def test_it_compiles_until_it_meets_the_other_process(tmp_path):
+    compiled = in_fresh_cache(
+        tmp_path,
+        """
+        from backbones.kernels import ahead, sums
+        sums._thin.address
+        ahead._ORDER = ("sums._measure", "composite._seen", "sums._thin", "sums._fold")
+        ahead.main()
+        """,
+        GRIDREG_COMPILE_AHEAD="0",
+    )
+    assert compiled == ["composite._seen", "sums._measure", "sums._thin"]
+
+
+@pytest.mark.skipif(ahead._processors() < 2, reason="needs a second processor")
+def test_an_empty_cache_starts_it(tmp_path):
+    compiled = in_fresh_cache(
+        tmp_path,
+        """
+        import time
+        from backbones.kernels import sums
+        from backbones.kernels.encode import _forward
+        sums._measure.address
+        # Of the second process; this one has no use for it.
+        end = time.monotonic() + 100
+        while not _forward.cached and time.monotonic() < end:
+            time.sleep(0.1)
+        assert _forward.cached
+        _forward.address
+        """,
+        GRIDREG_COMPILE_AHEAD="1",
+    )
+    assert {"encode._forward", "sums._measure"} <= set(compiled)
+
+
+def test_not_where_it_is_forbidden_or_of_no_use(monkeypatch):
+    monkeypatch.setenv("GRIDREG_COMPILE_AHEAD", "0")
+    assert ahead.start() is None
+    monkeypatch.setenv("GRIDREG_COMPILE_AHEAD", "1")
+    monkeypatch.setattr(ahead, "_processors", lambda: 1)
+    assert ahead.start() is None
