@@ -264,6 +264,39 @@ def study_table(records: Sequence[dict[str, Any]]) -> str:
     return table(head, [*first, *(row for _, row in compared)])
 
 
+def beside_plain(folder: Path = STORE) -> str:
+    """The compiled path beside the plain one, of runs that have both, by seed; nothing without any."""
+    found: dict[tuple[str, str, str, int, int], dict[str, dict[str, Any]]] = {}
+    for path in sorted(folder.glob("*.json")):
+        record = json.loads(path.read_text(encoding="utf-8"))
+        if not record["changes"]:
+            key = tuple(record[name] for name in ("scene", "protocol", "run", "steps", "seed"))
+            plain = "--backend" in record["command"]
+            found.setdefault(key, {})["plain" if plain else "compiled"] = record
+    rows, gains = [], []
+    for (scene, protocol, run, steps, seed), both in sorted(found.items()):
+        if len(both) == 2:
+            plain, compiled = both["plain"], both["compiled"]
+            gains.append(psnr(compiled) - psnr(plain))
+            rows.append(
+                [
+                    f"`{run}`, {scene}, {protocol}, {steps} iterations", str(seed),
+                    *(f"{psnr(record):.2f}" for record in (plain, compiled)), signed(gains[-1]),
+                    *(f"{record['seconds']['train']:.0f}" for record in (plain, compiled)),
+                ]
+            )  # fmt: skip
+    if not rows:
+        return ""
+    mean = estimate(gains)
+    spread = "" if mean.half_width is None else f" [{signed(mean.low)}, {signed(mean.high)}]"
+    head = ["run", "seed", "plain (dB)", "compiled (dB)", "difference", "plain (s)", "compiled (s)"]
+    return (
+        "\n## The compiled path beside the plain one\n\nTrained by plain PyTorch (`benchmarks/quality.py --backend torch`) "
+        "and by the compiled kernels, in equal steps, with one thread\nbeside another run, and both scored by the kernels. "
+        f"Mean difference: {signed(mean.mean)}{spread} dB.\n\n" + table(head, rows)
+    )
+
+
 def verdict(found: Estimate | None, claimed: float) -> str:
     """What our pairs say about a claimed gain, dB; the rule stands on the page."""
     if found is None:
@@ -370,6 +403,7 @@ def page(runs: Runs) -> str:
         bodies(runs),
         "\n## Claims\n\n",
         claims(runs),
+        beside_plain(),
         PICTURES,
         study_tables(),
     ]

@@ -86,3 +86,20 @@ def test_studies_are_compared_with_their_baseline(results: ModuleType, tmp_path:
         "| better | – | 27.25 (1) | +0.25 | +0.25 to +0.25 |",
         "| worse | 28.50 (1) | 26.50 (1) | −0.50 | −0.50 to −0.50 |",
     ]
+
+
+def test_paths_are_compared_at_equal_steps_and_seeds(results: ModuleType, tmp_path: Path) -> None:
+    assert results.beside_plain(tmp_path) == ""
+    plain = ["quality.py", "--steps", "150", "--backend", "torch"]
+    for seed, (slow, fast) in enumerate([(24.0, 24.5), (25.0, 24.5)]):
+        store(tmp_path, "quick", "lego", seed, slow, steps=150, command=plain)
+        store(tmp_path, "quick", "lego", seed, fast, steps=150, command=plain[:3])
+    # Without a partner of as many steps.
+    store(tmp_path, "quick", "lego", 0, 27.0, steps=1200)
+    text = results.beside_plain(tmp_path)
+    assert "Mean difference: 0.00 [−6.35, +6.35] dB." in text
+    rows = [line for line in text.splitlines() if line.startswith("| `quick`")]
+    assert rows == [
+        "| `quick`, lego, dietnerf8, 150 iterations | 0 | 24.00 | 24.50 | +0.50 | 120 | 120 |",
+        "| `quick`, lego, dietnerf8, 150 iterations | 1 | 25.00 | 24.50 | −0.50 | 120 | 120 |",
+    ]
