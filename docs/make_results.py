@@ -291,8 +291,9 @@ def beside_plain(folder: Path = STORE) -> str:
     spread = "" if mean.half_width is None else f" [{signed(mean.low)}, {signed(mean.high)}]"
     head = ["run", "seed", "plain (dB)", "compiled (dB)", "difference", "plain (s)", "compiled (s)"]
     return (
-        "\n## The compiled path beside the plain one\n\nTrained by plain PyTorch (`benchmarks/quality.py --backend torch`) "
-        "and by the compiled kernels, in equal steps, with one thread\nbeside another run, and both scored by the kernels. "
+        "\n## The compiled path beside the plain one\n\nTrained by plain PyTorch (`benchmarks/quality.py --backend "
+        "torch`) and by the compiled kernels, in equal steps,\nwith one thread beside another run, and both scored by "
+        "the kernels. "
         f"Mean difference: {signed(mean.mean)}{spread} dB.\n\n" + table(head, rows)
     )
 
