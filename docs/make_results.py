@@ -188,7 +188,13 @@ STUDIES = (
     (
         "finetuned_search",
         "Changes to Few TensoRF, fine-tuned",
-        "One change at a time.",
+        "One change at a time. Without masks, or with masks that open soon, copies of the chair hang before the cameras, "
+        "and it can be seen through itself (validation views r_14 and r_63); lego is blurred all over.",
+    ),
+    (
+        "finetuned_full",
+        "Changes to Few TensoRF, fine-tuned, at its full length",
+        "On chair, where it misses the published figure.",
     ),
     (
         "best_leave_one_out",

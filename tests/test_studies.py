@@ -54,6 +54,9 @@ ROWS = {
         "as it is", "no masks", "masks until 0.2", "masks on encodings alone", "total variation in every iteration",
         "total variation 0.002", "total variation 0.006", "total variation 0.002 and masks until 0.2",
     ],
+    "finetuned_full": [
+        "as it is", "masks until 0.5", "faster learning", "random background", "total variation 0.004",
+    ],
     "occlusion_near": [
         "none", "20 samples from the box", "0.625 from the near plane", "20 samples until the box shrinks",
     ],
