@@ -11,9 +11,21 @@ import json
 import math
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parent))
+from results_text import (
+    BODIES,
+    BODY_METHODS,
+    CLAIMS,
+    HEAD,
+    METHODS,
+    PICTURES,
+    RULE,
+    SCENES,
+    STUDIES,
+)
 
 from gridreg.ablation.statistics import Estimate, estimate
 from gridreg.ablation.tables import signed
@@ -22,57 +34,6 @@ from gridreg.training.files import write_text
 PAGE = Path(__file__).with_name("results.md")
 STUDY_STORE = Path(__file__).parent.parent / "benchmarks" / "results"
 STORE = STUDY_STORE / "quality"
-
-HEAD = """# Results
-
-Every figure on this page is computed from the files in `benchmarks/results/quality/`, one for each run, which
-`benchmarks/quality.py` wrote; `python docs/make_results.py` writes the page from them. Ours are means over the test
-views of the protocol and, where there are several, over seeds; ± and [ ] are 95 % intervals (Student's t) over seeds,
-or over pairs of the same scene and seed. "α" marks rows that use the pictures' alpha to carve the box. A dash is a run
-that has not been made. Runs with one thread ran beside another one on the same two cores.
-
-Published figures are those of the Few TensoRF paper, whose rows for TensoRF and FreeNeRF are its own reproductions. Its
-text does not say which eight views it used; its released configuration has those of `fewtensorf8`. Published baselines
-scatter by 1 to 2 dB between papers, so only rows of one program under one protocol compare. The occlusion loss of the
-fine-tuned row has FreeNeRF's range from the near plane, that of the raw one counts samples from the box.
-
-"""
-
-
-@dataclass(frozen=True)
-class Method:
-    """A row: how it is called, the run of `benchmarks/quality.py`, and what was published for it by scene."""
-
-    name: str
-    run: str
-    published: dict[str, float]
-
-
-SCENES = ("lego", "chair")
-METHODS = (
-    Method("TensoRF", "tensorf", {"lego": 23.83, "chair": 23.45}),
-    Method("Few TensoRF, raw", "few_tensorf", {"lego": 25.68, "chair": 27.70}),
-    Method("Few TensoRF, fine-tuned", "few_tensorf_finetuned", {"lego": 25.73, "chair": 27.71}),
-    Method("Few TensoRF, masks as printed", "few_tensorf:few_tensorf_printed", {}),
-    Method("FreeNeRF", "freenerf", {"lego": 24.81, "chair": 27.01}),
-    Method("in the style of FourieRF", "fourierf", {}),
-    Method("in the style of SANeRF", "sanerf", {}),
-    Method("`quick`", "quick", {}),
-    Method("`best`", "best", {}),
-    Method("`best-long`", "best-long", {}),
-)
-BODIES = ("subject_a", "subject_b")
-BODY_METHODS = (
-    ("TensoRF, 50 views", "human50", "tensorf"),
-    ("TensoRF, 8 views", "human8", "tensorf"),
-    ("Few TensoRF, fine-tuned, 8 views", "human8", "few_tensorf_finetuned"),
-    (
-        "Few TensoRF, fine-tuned, 8 views, fixed ratio 0.8",
-        "human8",
-        "few_tensorf_finetuned:few_tensorf_fixed",
-    ),
-    ("`human`, 8 views", "human8", "human"),
-)
 
 
 class Runs:
@@ -178,57 +139,6 @@ def bodies(runs: Runs) -> str:
     return table(["method", *(f"{scene}: PSNR (seeds)" for scene in BODIES)], rows)
 
 
-STUDIES = (
-    (
-        "occlusion_near",
-        "Where the occlusion loss of Few TensoRF begins",
-        "Twenty samples from the ray's entry into the box, which shrinks to the object, or FreeNeRF's range from the "
-        "near plane.",
-    ),
-    (
-        "finetuned_search",
-        "Changes to Few TensoRF, fine-tuned",
-        "One change at a time. Without masks, or with masks that open soon, copies of the chair hang before the cameras, "
-        "and it can be seen through itself (validation views r_14 and r_63); lego is blurred all over.",
-    ),
-    (
-        "finetuned_full",
-        "Changes to Few TensoRF, fine-tuned, at its full length",
-        "On chair, where it misses the published figure.",
-    ),
-    (
-        "best_leave_one_out",
-        "Pieces of `best`",
-        "One piece left out at a time; what a negative figure says is lost without it.",
-    ),
-    (
-        "best_pieces",
-        "Pieces of `best` as it was",
-        "An earlier `best`, with masks and 2,500 iterations in full, one piece left out at a time.",
-    ),
-    (
-        "best_more",
-        "More of `best`",
-        "Without masks; one change at a time, and at last iterations that cost less, which it has now.",
-    ),
-    (
-        "human_search",
-        "`best` on bodies",
-        "What the preset `human` was chosen from; PSNR alone, as validation has no meshes.",
-    ),
-    (
-        "best_rates",
-        "Learning rates of `best`",
-        "As it was with masks and without distortion penalty; one run a row.",
-    ),
-    (
-        "best_search",
-        "Changes to `best`",
-        "As it was then, one change at a time; what did not help stayed out.",
-    ),
-)
-
-
 def study_tables(folder: Path = STUDY_STORE) -> str:
     """PSNR of the studies' rows on each scene, and their mean difference to the baseline."""
     parts = []
@@ -315,73 +225,6 @@ def verdict(found: Estimate | None, claimed: float) -> str:
     if found.high < 0:
         return "the opposite"
     return "within noise"
-
-
-RULE = """A claimed gain *holds* if the interval of our paired differences lies above 0 and reaches the claim; it *holds
-in sign* if it lies above 0 and below the claim; *the opposite* is an interval below 0; one that has 0 inside is *within
-noise*.
-
-"""
-
-
-PICTURES = """
-## What the pictures show
-
-
-Made by `benchmarks/quality.py --keep` and `benchmarks/error_pictures.py`, and looked at; they show other people's
-scenes, so they are not part of the project.
-
-* lego, `tensorf` (r_144, 26.5 dB): the bucket's inside is too dark and flat, its rivets doubled; the grille is
-  smeared. No haze, sharp outlines.
-* lego, `few_tensorf` (the same view, 26.4 dB): the bucket's inside is blotched, light streaks of fog lie between
-  the tracks and before the grille, a white cloud hangs under the front; in low views (r_72, r_80, r_120) a fringe
-  of haze hangs below the ground plate, which no training view sees from the side. From behind and above (r_0, r_8,
-  r_192) white specks lie on the ground.
-* lego, `best` (the same view, 29.4 dB): no fog and no haze. What is left: edges one pixel wide, the gaps of the
-  tracks and of the grille, the inner wall of the bucket, a little soft. The worst views are the low ones from the
-  side (24.6 dB) and the one from behind and above (24.1 dB).
-* chair, `tensorf` (r_152, 27.3 dB): closed, patterns readable, a little darker than it is. A green patch hangs above
-  the chair in views from behind and above (r_0, r_168 to r_192): the rest of a wall right before a training camera.
-* chair, `few_tensorf_finetuned` (the same view, 25.6 dB): no wall. White wood before the white background can be seen
-  through: legs, armrests and the rim below the seat are frayed, most in views from the side (r_64 to r_80, 21.7 to
-  22.6 dB). With an occlusion loss that counts 20 samples from the box, the front legs are eaten away as well.
-* chair, `best` (r_64, 26.0 dB; r_152, 30.1 dB): upright, closed, patterns readable. The ornaments are blurred where
-  they sit on thin wood, the shadow side of the legs is hazy, the armrest's cloth has lost its pattern, and seat and
-  back are a little too bright all over: their sheen is seen from one direction by one training view.
-"""
-
-
-# What is claimed, on which scenes, under which protocol, of which run over which other, and how much (dB).
-CLAIMS: tuple[tuple[str, tuple[str, ...], str, str, str, float], ...] = (
-    (
-        "Few TensoRF, raw, gains over TensoRF (lego 1.85, chair 4.25)",
-        SCENES, "dietnerf8", "few_tensorf", "tensorf", 3.05,
-    ),
-    (
-        "Few TensoRF, fine-tuned, gains over TensoRF (lego 1.90, chair 4.26)",
-        SCENES, "dietnerf8", "few_tensorf_finetuned", "tensorf", 3.08,
-    ),
-    (
-        "10,000 iterations (fine-tuned) are better than 15,000 (raw) (lego 0.05, chair 0.01)",
-        SCENES, "dietnerf8", "few_tensorf_finetuned", "few_tensorf", 0.03,
-    ),
-    (
-        "Masks in blocks gain over those printed (not published)",
-        SCENES, "dietnerf8", "few_tensorf", "few_tensorf:few_tensorf_printed", 0.0,
-    ),
-    (
-        "Bodies: TensoRF at 8 views gains over Few TensoRF with the fixed ratio (1.00 and 0.28)",
-        BODIES, "human8", "tensorf", "few_tensorf_finetuned:few_tensorf_fixed", 0.64,
-    ),
-    (
-        "`best` gains over Few TensoRF, fine-tuned, both ours",
-        SCENES, "dietnerf8", "best", "few_tensorf_finetuned", 0.0,
-    ),
-    (
-        "`human` gains over TensoRF at 8 views (our target: 1.5)",
-        BODIES, "human8", "human", "tensorf", 1.5,
-    ),
-)  # fmt: skip
 
 
 def claims(runs: Runs) -> str:
