@@ -177,3 +177,9 @@ def test_another_backbone_comes_with_options_and_regularizers_that_fit_it(preset
     assert (config.field, config.composition) == (fitting.field, fitting.composition)
     own = configure(TrainOptions(preset=preset, backbone=backbone, composition="none"))
     assert own.composition == "none"
+
+
+def test_best_long_is_best_with_more_iterations():
+    best, long = load_preset("best"), load_preset("best-long")
+    assert long.train == best.train.scaled(long.train.steps)
+    assert (long.backbone, long.field, long.composition) == (best.backbone, best.field, best.composition)
