@@ -124,7 +124,7 @@ class Kernel:
                 folder = self._folder
                 with _one_process(folder, "gridreg-kernels"):
                     empty = _forget_outdated(folder)
-                if empty and self.function.__module__.startswith(__package__):
+                if empty and fcntl is not None and self.function.__module__.startswith(__package__):
                     _compile_ahead()
                 with _one_process(folder, self.name):
                     return compiled(cache=True)(self.function)
