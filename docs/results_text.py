@@ -132,9 +132,13 @@ scenes, so they are not part of the project.
 * chair, `few_tensorf_finetuned` (the same view, 25.6 dB): no wall. White wood before the white background can be seen
   through: legs, armrests and the rim below the seat are frayed, most in views from the side (r_64 to r_80, 21.7 to
   22.6 dB). With an occlusion loss that counts 20 samples from the box, the front legs are eaten away as well.
+* chair, `few_tensorf` (r_72, 21.9 dB; r_160, 24.0 dB): the rim below the seat and the edges of the seat are torn into
+  streaks, front legs and armrests are grey and can be seen through; no wall.
 * chair, `best` (r_64, 26.0 dB; r_152, 30.1 dB): upright, closed, patterns readable. The ornaments are blurred where
   they sit on thin wood, the shadow side of the legs is hazy, the armrest's cloth has lost its pattern, and seat and
   back are a little too bright all over: their sheen is seen from one direction by one training view.
+* chair and lego, `best-long` (r_72, 25.8 dB, and r_160, 27.6 dB; r_144, 29.9 dB, and r_72, 26.0 dB): the faults of
+  `best`, fainter; on lego the studs on top, one pixel wide, and the line below the ground plate stand out.
 """
 
 # What is claimed, on which scenes, under which protocol, of which run over which other, and how much (dB).
