@@ -36,13 +36,17 @@ STUDY_STORE = Path(__file__).parent.parent / "benchmarks" / "results"
 STORE = STUDY_STORE / "quality"
 
 
+def records_in(folder: Path) -> list[dict[str, Any]]:
+    """All stored runs of a folder, in the order of their names."""
+    return [json.loads(path.read_text(encoding="utf-8")) for path in sorted(folder.glob("*.json"))]
+
+
 class Runs:
     """The stored runs, by scene, protocol, run and seed; shortened and changed runs are left out."""
 
     def __init__(self, folder: Path = STORE) -> None:
         self.records: dict[tuple[str, str, str], dict[int, dict[str, Any]]] = {}
-        for path in sorted(folder.glob("*.json")):
-            record = json.loads(path.read_text(encoding="utf-8"))
+        for record in records_in(folder):
             if "--steps" in record["command"] or record["changes"]:
                 continue
             key = (record["scene"], record["protocol"], record["run"])
@@ -96,6 +100,12 @@ def with_spread(found: Estimate | None, digits: int = 2) -> str:
     return f"{found.mean:.{digits}f}{spread} ({found.count})"
 
 
+def with_interval(found: Estimate) -> str:
+    """``−0.04 [−0.14, +0.06]``, or the mean of one pair alone."""
+    spread = "" if found.half_width is None else f" [{signed(found.low)}, {signed(found.high)}]"
+    return f"{signed(found.mean)}{spread}"
+
+
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Markdown."""
     lines = [head, ["---"] * len(head), *rows]
@@ -143,9 +153,7 @@ def study_tables(folder: Path = STUDY_STORE) -> str:
     """PSNR of the studies' rows on each scene, and their mean difference to the baseline."""
     parts = []
     for name, title, about in STUDIES:
-        records = [
-            json.loads(path.read_text(encoding="utf-8")) for path in sorted((folder / name).glob("*.json"))
-        ]
+        records = records_in(folder / name)
         if records:
             first = records[0]
             where = f"`{first['protocol']}`, {first['steps']} iterations, `examples/studies/{name}.yaml`"
@@ -183,8 +191,7 @@ def study_table(records: Sequence[dict[str, Any]]) -> str:
 def beside_plain(folder: Path = STORE) -> str:
     """The compiled path beside the plain one, of runs that have both, by seed; nothing without any."""
     found: dict[tuple[str, str, str, int, int], dict[str, dict[str, Any]]] = {}
-    for path in sorted(folder.glob("*.json")):
-        record = json.loads(path.read_text(encoding="utf-8"))
+    for record in records_in(folder):
         if not record["changes"]:
             key = tuple(record[name] for name in ("scene", "protocol", "run", "steps", "seed"))
             plain = "--backend" in record["command"]
@@ -203,14 +210,12 @@ def beside_plain(folder: Path = STORE) -> str:
             )  # fmt: skip
     if not rows:
         return ""
-    mean = estimate(gains)
-    spread = "" if mean.half_width is None else f" [{signed(mean.low)}, {signed(mean.high)}]"
     head = ["run", "seed", "plain (dB)", "compiled (dB)", "difference", "plain (s)", "compiled (s)"]
     return (
         "\n## The compiled path beside the plain one\n\nTrained by plain PyTorch (`benchmarks/quality.py --backend "
         "torch`) and by the compiled kernels, in equal steps,\nwith one thread beside another run, and both scored by "
         "the kernels. "
-        f"Mean difference: {signed(mean.mean)}{spread} dB.\n\n" + table(head, rows)
+        f"Mean difference: {with_interval(estimate(gains))} dB.\n\n" + table(head, rows)
     )
 
 
@@ -232,10 +237,7 @@ def claims(runs: Runs) -> str:
     rows = []
     for text, scenes, protocol, run, base, claimed in CLAIMS:
         found = runs.gains(scenes, protocol, run, base)
-        seen = "–"
-        if found is not None:
-            spread = "" if found.half_width is None else f" [{signed(found.low)}, {signed(found.high)}]"
-            seen = f"{signed(found.mean)}{spread} ({found.count})"
+        seen = "–" if found is None else f"{with_interval(found)} ({found.count})"
         rows.append([text, signed(claimed) if claimed else "", seen, verdict(found, claimed)])
     return RULE + table(["claim", "published (dB)", "ours (dB; pairs)", "verdict"], rows)
 

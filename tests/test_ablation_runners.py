@@ -16,11 +16,12 @@ import torch
 from gridreg.ablation import runners
 from gridreg.ablation.claims import ClaimLostError
 from gridreg.ablation.perform import LOG_NAME, Scenes, describe_machine, locate_scene, perform, reason_of
-from gridreg.ablation.processes import Processes, usable_cores
+from gridreg.ablation.processes import Processes
 from gridreg.ablation.runners import InProcess
 from gridreg.ablation.store import Store
 from gridreg.ablation.worker import main as worker_main
 from gridreg.ablation.workers import Worker
+from gridreg.cores import usable_cores
 from gridreg.errors import InputError
 from gridreg.scenes import builtin_scene
 from gridreg.training import execute

@@ -12,6 +12,7 @@ import pytest
 
 from backbones.kernels import ahead, compiler
 from backbones.kernels.compiler import Kernel
+from gridreg.cores import usable_cores
 
 
 @pytest.mark.parametrize("name", ahead._ORDER)
@@ -50,7 +51,7 @@ def test_it_compiles_until_it_meets_the_other_process(tmp_path):
 
 
 @pytest.mark.skipif(
-    ahead._processors() < 2 or compiler.fcntl is None,
+    usable_cores() < 2 or compiler.fcntl is None,
     reason="needs a second processor and files that can be locked",
 )
 def test_an_empty_cache_starts_it(tmp_path):
@@ -77,5 +78,5 @@ def test_not_where_it_is_forbidden_or_of_no_use(monkeypatch):
     monkeypatch.setenv("GRIDREG_COMPILE_AHEAD", "0")
     assert ahead.start() is None
     monkeypatch.setenv("GRIDREG_COMPILE_AHEAD", "1")
-    monkeypatch.setattr(ahead, "_processors", lambda: 1)
+    monkeypatch.setattr(ahead, "usable_cores", lambda: 1)
     assert ahead.start() is None

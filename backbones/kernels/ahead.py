@@ -14,9 +14,9 @@ import importlib
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 from backbones.kernels.dot_blocks import available
+from gridreg.cores import usable_cores
 
 __all__ = ["main", "start"]
 
@@ -46,28 +46,21 @@ _ORDER = (
 _DOTS = ("dots", "perceptron")
 
 
-def _processors() -> int:
-    affinity = getattr(os, "sched_getaffinity", None)
-    return len(affinity(0)) if affinity else os.cpu_count() or 1
-
-
 def start() -> subprocess.Popen[bytes] | None:
     """Start the second process, if a processor is free for it; it ends with this one.
 
     The variable ``GRIDREG_COMPILE_AHEAD=0`` forbids it.
     """
     frozen = getattr(sys, "frozen", False) or not sys.executable
-    if frozen or _processors() < 2 or os.environ.get(_SWITCH, "1") == "0":
+    if frozen or usable_cores() < 2 or os.environ.get(_SWITCH, "1") == "0":
         return None
-    root = str(Path(__file__).parents[2])
-    path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
     try:
         helper = subprocess.Popen(
             [sys.executable, "-m", __name__],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
-            env={**os.environ, _SWITCH: "0", "PYTHONPATH": path},
+            env={**os.environ, _SWITCH: "0", "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
         )
     except OSError:
         return None

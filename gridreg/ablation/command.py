@@ -9,12 +9,13 @@ from typing import Literal
 
 import tyro
 
-from gridreg.ablation.processes import Processes, usable_cores
+from gridreg.ablation.processes import Processes
 from gridreg.ablation.progress import StudyProgress, dry_run_lines
 from gridreg.ablation.records import RunResult, Study
 from gridreg.ablation.runners import InProcess, Runner
 from gridreg.ablation.store import Store
 from gridreg.ablation.study import load_study
+from gridreg.cores import usable_cores
 from gridreg.errors import InputError
 
 __all__ = ["AblationOptions", "make_runner", "run"]

@@ -13,11 +13,12 @@ from gridreg.ablation.records import Study
 from gridreg.ablation.runners import Event, Report
 from gridreg.ablation.store import Store
 from gridreg.ablation.workers import Worker
+from gridreg.cores import usable_cores
 from gridreg.errors import InputError
 from gridreg.training.files import output_errors
 from gridreg.training.progress import Interruption, interruptible
 
-__all__ = ["LOG_NAME", "Processes", "usable_cores"]
+__all__ = ["LOG_NAME", "Processes"]
 
 LOG_NAME = "workers.log"
 """File in the store with what worker processes print outside of runs."""
@@ -27,11 +28,6 @@ LOG_NAME = "workers.log"
 _APART: dict[str, Any] = {"process_group": 0} if sys.version_info >= (3, 11) else {"start_new_session": True}
 _POLL = 0.2
 _MOST_IDLE_DEATHS = 3
-
-
-def usable_cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @dataclass

@@ -10,13 +10,13 @@ from typing import Any
 from gridreg.ablation.claims import Claim, ClaimLostError, Heartbeat
 from gridreg.ablation.packing import pack_folder, unpack_folder
 from gridreg.ablation.perform import Scenes, scene_key
-from gridreg.ablation.processes import usable_cores
 from gridreg.ablation.ray_cluster import connected, import_ray
 from gridreg.ablation.ray_task import Order, Reply, carry_out
 from gridreg.ablation.records import Study
 from gridreg.ablation.runners import Event, Report, finish_or_fail
 from gridreg.ablation.store import Store
 from gridreg.ablation.workers import Worker
+from gridreg.cores import usable_cores
 from gridreg.errors import InputError
 from gridreg.training.progress import Interruption, interruptible
 

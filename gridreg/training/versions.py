@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import platform
 from importlib import metadata
 from pathlib import Path
 
 import torch
+
+from gridreg.cores import usable_cores
 
 __all__ = ["cpu_model", "package_version", "versions"]
 
@@ -30,7 +31,7 @@ def versions() -> dict[str, str | int]:
     found["platform"] = platform.platform()
     found["cpu"] = cpu_model()
     found["instructions"] = torch.backends.cpu.get_cpu_capability()
-    found["cores"] = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    found["cores"] = usable_cores()
     found["threads"] = torch.get_num_threads()
     return found
 
