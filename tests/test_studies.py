@@ -55,7 +55,15 @@ ROWS = {
         "total variation 0.002", "total variation 0.006", "total variation 0.002 and masks until 0.2",
     ],
     "finetuned_full": [
-        "as it is", "masks until 0.5", "faster learning", "random background", "total variation 0.004",
+        "as it is", "masks until 0.5", "faster learning", "total variation 0.004", "random background",
+        "random background and total variation 0.004", "random background and features alone in the network",
+        "random background and carving", "random background, carving and total variation 0.004",
+        "random background, carving and faster learning",
+        "random background, carving and features alone in the network",
+    ],
+    "best_views": [
+        "best", "no direction", "direction without octaves", "features without octaves", "dropout of the direction",
+        "no small pieces",
     ],
     "occlusion_near": [
         "none", "20 samples from the box", "0.625 from the near plane", "20 samples until the box shrinks",
