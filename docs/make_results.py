@@ -63,13 +63,13 @@ class Runs:
         found = [pick(record) for record in self.of(scene, protocol, run).values()]
         return estimate(found) if found else None
 
-    def gains(self, scenes: Sequence[str], protocol: str, run: str, base: str) -> Estimate | None:
+    def gains(self, scenes: Sequence[str], protocol: str, run: str, base: str) -> list[float]:
         """Differences of PSNR (dB) of two runs, over the pairs of scene and seed that both have."""
         pairs = []
         for scene in scenes:
             ours, theirs = self.of(scene, protocol, run), self.of(scene, protocol, base)
             pairs += [psnr(ours[seed]) - psnr(theirs[seed]) for seed in sorted(ours.keys() & theirs.keys())]
-        return estimate(pairs) if pairs else None
+        return pairs
 
 
 def psnr(record: dict[str, Any]) -> float:
@@ -219,26 +219,29 @@ def beside_plain(folder: Path = STORE) -> str:
     )
 
 
-def verdict(found: Estimate | None, claimed: float) -> str:
+def verdict(gains: Sequence[float], claimed: float) -> str:
     """What our pairs say about a claimed gain, dB; the rule stands on the page."""
-    if found is None:
+    if not gains:
         return "not measured"
+    found = estimate(gains)
     if found.half_width is None:
         return "one pair: no verdict"
     if found.low > 0:
         return "holds" if found.high >= claimed else "holds in sign, but is smaller"
     if found.high < 0:
         return "the opposite"
-    return "within noise"
+    if max(gains) < 0:
+        return "the opposite in every pair, too few to be sure"
+    return "in sign in every pair, too few to be sure" if min(gains) > 0 else "within noise"
 
 
 def claims(runs: Runs) -> str:
     """A verdict for every claim."""
     rows = []
     for text, scenes, protocol, run, base, claimed in CLAIMS:
-        found = runs.gains(scenes, protocol, run, base)
-        seen = "–" if found is None else f"{with_interval(found)} ({found.count})"
-        rows.append([text, signed(claimed) if claimed else "", seen, verdict(found, claimed)])
+        gains = runs.gains(scenes, protocol, run, base)
+        seen = f"{with_interval(estimate(gains))} ({len(gains)})" if gains else "–"
+        rows.append([text, signed(claimed) if claimed else "", seen, verdict(gains, claimed)])
     return RULE + table(["claim", "published (dB)", "ours (dB; pairs)", "verdict"], rows)
 
 

@@ -113,7 +113,7 @@ STUDIES = (
 
 RULE = """A claimed gain *holds* if the interval of our paired differences lies above 0 and reaches the claim; it *holds
 in sign* if it lies above 0 and below the claim; *the opposite* is an interval below 0; one that has 0 inside is *within
-noise*.
+noise*, unless all pairs have one sign, which two or three of them may have by chance.
 
 """
 

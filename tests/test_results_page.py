@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 
-from gridreg.ablation.statistics import Estimate
 from tests.programs import ROOT, module_at
 
 
@@ -50,24 +49,26 @@ def test_gains_are_paired(results: ModuleType, tmp_path: Path) -> None:
         store(tmp_path, "tensorf", "lego", seed, plain)
     store(tmp_path, "tensorf", "chair", 0, 99.0)
     found = results.Runs(tmp_path).gains(("lego", "chair"), "dietnerf8", "few_tensorf", "tensorf")
-    assert (found.mean, found.count) == (2.25, 2)
+    assert found == [2.0, 2.5]
     text = results.claims(results.Runs(tmp_path))
-    assert "| +3.05 | +2.25 [−0.93, +5.43] (2) | within noise |" in text
+    assert "| +3.05 | +2.25 [−0.93, +5.43] (2) | in sign in every pair, too few to be sure |" in text
 
 
 @pytest.mark.parametrize(
-    ("found", "said"),
+    ("gains", "said"),
     [
-        (None, "not measured"),
-        (Estimate(1.0, None, 1), "one pair: no verdict"),
-        (Estimate(1.0, 0.5, 3), "holds"),
-        (Estimate(0.8, 0.1, 3), "holds in sign, but is smaller"),
-        (Estimate(0.2, 0.5, 3), "within noise"),
-        (Estimate(-1.0, 0.5, 3), "the opposite"),
+        ([], "not measured"),
+        ([1.0], "one pair: no verdict"),
+        ([1.0, 1.1, 1.2], "holds"),
+        ([0.8, 0.85, 0.9], "holds in sign, but is smaller"),
+        ([0.2, 0.5, -0.3], "within noise"),
+        ([-1.0, -1.1, -1.2], "the opposite"),
+        ([0.1, 3.0], "in sign in every pair, too few to be sure"),
+        ([-0.1, -3.0], "the opposite in every pair, too few to be sure"),
     ],
 )
-def test_verdicts(results: ModuleType, found: Estimate | None, said: str) -> None:
-    assert results.verdict(found, 1.2) == said
+def test_verdicts(results: ModuleType, gains: list[float], said: str) -> None:
+    assert results.verdict(gains, 1.2) == said
 
 
 def test_studies_are_compared_with_their_baseline(results: ModuleType, tmp_path: Path) -> None:
