@@ -185,11 +185,15 @@ def test_best_long_is_best_with_more_iterations():
     assert (long.backbone, long.field, long.composition) == (best.backbone, best.field, best.composition)
 
 
-def test_finetuned_is_the_published_schedule_with_three_changes():
+def test_finetuned_is_the_published_schedule_with_four_changes():
     published, ours = load_preset("few_tensorf_10k"), load_preset("few_tensorf_finetuned")
     assert ours.train == replace(published.train, carve=True)
     changed = {"decoder": "mlp_fea", "density_shift": None, "initial_opacity": 0.1}
     assert ours.field == {**published.field, **changed}
-    kept = [part for part in published.composition if part.get("site") != "encoding.position"]
-    assert ours.composition == [*kept, {"name": "RandomBackground"}]
-    assert len(kept) == len(published.composition) - 1
+    left = [
+        part
+        for part in published.composition
+        if part["name"] != "Orthogonality" and part.get("site") != "encoding.position"
+    ]
+    assert ours.composition == [*left, {"name": "RandomBackground"}]
+    assert len(left) == len(published.composition) - 3

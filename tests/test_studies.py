@@ -55,11 +55,14 @@ ROWS = {
         "total variation 0.002", "total variation 0.006", "total variation 0.002 and masks until 0.2",
     ],
     "finetuned_full": [
-        "as it is", "masks until 0.5", "faster learning", "total variation 0.004", "random background",
+        "as it is", "masks until 0.5", "faster learning", "total variation 0.004", "no orthogonality",
+        "random background",
         "random background and total variation 0.004", "random background and features alone in the network",
         "random background and carving", "random background, carving and total variation 0.004",
         "random background, carving and faster learning",
         "random background, carving and features alone in the network",
+        "random background, carving, features alone in the network, masks until 0.2",
+        "random background, carving, features alone in the network, no orthogonality",
     ],
     "best_views": [
         "best", "no direction", "direction without octaves", "features without octaves", "dropout of the direction",
