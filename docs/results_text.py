@@ -151,8 +151,8 @@ scenes, so they are not part of the project.
 * chair, `few_tensorf_finetuned` (r_152, 28.8 dB): legs and rim are whole, cloth and ornaments readable; the right edge
   of the back is grainy, specks hang between armrest and back.
 * lego, `few_tensorf_finetuned` (r_144, 26.9 dB; r_80, 23.0 dB): plate, tracks and grille are cleaner than TensoRF's,
-  the bucket's inside is as blotched, a tuft of brown fog hangs under a tooth. In low views a fringe of haze lies below the
-  ground plate, in the part of the hull that no training view sees from the side.
+  the bucket's inside is as blotched, a tuft of brown fog hangs under a tooth. In low views a fringe of haze lies below
+  the ground plate, in the part of the hull that no training view sees from the side.
 * subject_a (0022: TensoRF 33.3, `few_tensorf_10k:few_tensorf_fixed` 30.3, `human` 36.2 dB): TensoRF smears the shirt's
   pocket, leaves a fringe between the legs and grey patches in the face. With masks fixed at 0.8 the white lines of the
   shirt are torn into dashes, face and trousers are blotched. `few_tensorf_finetuned` (36.5 dB) and `human`
