@@ -14,7 +14,7 @@ import tyro
 from gridreg.cli import ending
 from gridreg.export import check_drawing, draw_run, live_view
 from gridreg.training import TrainOptions, configure, execute, open_scene, output_folder
-from gridreg.training.outputs import summary
+from gridreg.training.record import summary
 
 
 def main(options: TrainOptions) -> int:

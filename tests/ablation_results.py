@@ -13,7 +13,8 @@ import torch
 
 from gridreg.ablation.records import RunResult, RunSpec, Study
 from gridreg.training.curves import History
-from gridreg.training.outputs import metrics_record, save_view
+from gridreg.training.outputs import save_view
+from gridreg.training.record import metrics_record
 
 NASTY = "masks <b>\"bold\"</b> & 'co' | $x_1$ \\ {y}"
 GAINS = {

@@ -34,13 +34,8 @@ def run(options: EvalOptions) -> int:
     from gridreg.training.config import to_data
     from gridreg.training.evaluate import Scored, score_views
     from gridreg.training.files import check_output_folder
-    from gridreg.training.outputs import (
-        metrics_record,
-        save_contact_sheet,
-        save_metrics,
-        save_scored,
-        summary,
-    )
+    from gridreg.training.outputs import save_contact_sheet, save_scored
+    from gridreg.training.record import metrics_record, save_metrics, summary
 
     loaded = load_run(options.checkpoint)
     scene = scene_of(loaded, options.checkpoint, options.scene)

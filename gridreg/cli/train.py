@@ -7,7 +7,7 @@ from pathlib import Path
 
 from gridreg.export import check_drawing, draw_run, live_view
 from gridreg.training import TrainOptions, configure, execute, open_scene, output_folder
-from gridreg.training.outputs import summary
+from gridreg.training.record import summary
 
 __all__ = ["run"]
 

@@ -18,8 +18,9 @@ from gridreg.training.config import save_yaml, to_data
 from gridreg.training.curves import History, draw_curves, draw_masks
 from gridreg.training.evaluate import Scored, mean_psnr_of, score_views
 from gridreg.training.files import check_output_folder
-from gridreg.training.outputs import metrics_record, save_contact_sheet, save_metrics, save_scored
+from gridreg.training.outputs import save_contact_sheet, save_scored
 from gridreg.training.progress import Interruption, Progress, interruptible
+from gridreg.training.record import metrics_record, save_metrics
 from gridreg.training.run import build_trainer, resume_trainer, save_run
 from gridreg.training.settings import RunConfig
 from gridreg.training.trainer import StepReport, Trainer

@@ -1,4 +1,4 @@
-"""What a scored run leaves: renders beside targets, error maps, depth, and ``metrics.json``."""
+"""Pictures that a scored run leaves: renders beside targets, error maps, depth."""
 
 from __future__ import annotations
 
@@ -13,8 +13,6 @@ from torch import Tensor
 
 from gridreg.errors import InputError
 from gridreg.training.evaluate import Scored
-from gridreg.training.files import write_json
-from gridreg.training.metrics import json_ready, mean_metrics
 from gridreg.training.pictures import (
     Picture,
     coloured,
@@ -27,30 +25,18 @@ from gridreg.training.pictures import (
     thumbnail,
     to_picture,
 )
-from gridreg.training.versions import versions
 
 __all__ = [
-    "CONVENTIONS",
     "comparison",
     "depth_picture",
     "error_map",
-    "metrics_record",
     "save_contact_sheet",
-    "save_metrics",
     "save_scored",
     "save_view",
-    "summary",
 ]
 
 MAX_ERROR = 0.5
 """Upper end of the error maps' scale; fixed, so that pictures of different runs compare."""
-
-CONVENTIONS = {
-    "psnr": "dB; mean over images of -10 log10(MSE), images in [0, 1] after clamping",
-    "ssim_gaussian": "11x11 Gaussian window, sigma 1.5, population covariance (TensoRF and most)",
-    "ssim_uniform": "7x7 uniform window, sample covariance (FreeNeRF, scikit-image's default)",
-}
-"""What each metric in ``metrics.json`` means."""
 
 
 def error_map(image: Tensor, target: Tensor, max_error: float = MAX_ERROR) -> Picture:
@@ -215,84 +201,6 @@ def save_contact_sheet(
         for picture in rows
     ]
     save_png(path, np.concatenate(padded))
-
-
-def metrics_record(
-    views: Mapping[str, Mapping[str, float]],
-    *,
-    scene: str,
-    protocol: str,
-    builtin: bool,
-    seed: int,
-    steps: int,
-    seconds: Mapping[str, float],
-    config: Mapping[str, Any],
-    command: Sequence[str] = (),
-    train_views: Sequence[str] = (),
-    conventions: Mapping[str, str] | None = None,
-    **more: Any,
-) -> dict[str, Any]:
-    """The content of ``metrics.json``: scores of each view and their mean, and all it takes to judge them.
-
-    Args:
-        views: metrics by name of the test view.
-        scene: name of the scene.
-        protocol: name of the protocol.
-        builtin: whether the scene is the project's own. Then ``"benchmark"`` is false and the scene's name
-            says so, because its figures must not stand beside published ones.
-        seed: of the run.
-        steps: iterations done.
-        seconds: by phase, such as ``train`` and ``test``.
-        config: the configuration, plain data.
-        command: the command line.
-        train_views: names of the training views.
-        conventions: what further metrics mean, beside ``CONVENTIONS`` (for LPIPS: network and input range).
-        more: further plain data.
-
-    Raises:
-        InputError: if there is no view, or the views do not have the same metrics.
-    """
-    mean = mean_metrics(list(views.values()))
-    known = {**CONVENTIONS, **(conventions or {})}
-    record = {
-        "scene": f"{scene} (built-in, no benchmark)" if builtin else scene,
-        "builtin": builtin,
-        "benchmark": not builtin,
-        "protocol": protocol,
-        "mean": mean,
-        "images": {name: dict(values) for name, values in views.items()},
-        "conventions": {name: known[name] for name in mean if name in known},
-        "train_views": list(train_views),
-        "test_views": len(views),
-        "steps": steps,
-        "seed": seed,
-        "seconds": dict(seconds),
-        "command": list(command),
-        "config": dict(config),
-        "versions": versions(),
-        **more,
-    }
-    ready: dict[str, Any] = json_ready(record)
-    return ready
-
-
-def save_metrics(path: str | os.PathLike[str], record: Mapping[str, Any]) -> None:
-    """Write ``metrics_record`` as JSON with sorted keys, whole or not at all.
-
-    Raises:
-        InputError: if the place is not writable or the disk is full.
-    """
-    write_json(path, record)
-
-
-def summary(record: Mapping[str, Any]) -> str:
-    """The mean of ``metrics_record`` in one line, with what it is the mean of."""
-    mean = record["mean"]
-    views = record["test_views"]
-    return (
-        f"{record['scene']}, {record['protocol']}: mean of {views} test view{'s' if views != 1 else ''}: "
-        f"PSNR {mean['psnr']:.2f} dB, SSIM {mean['ssim_gaussian']:.4f} (11x11 Gaussian)"
-    )
 
 
 def _error(image: Tensor, target: Tensor) -> np.ndarray[Any, np.dtype[np.float64]]:
