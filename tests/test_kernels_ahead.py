@@ -10,7 +10,7 @@ import textwrap
 
 import pytest
 
-from backbones.kernels import ahead, compiler
+from backbones.kernels import ahead, cache
 from backbones.kernels.compiler import Kernel
 from gridreg.cores import usable_cores
 
@@ -51,7 +51,7 @@ def test_it_compiles_until_it_meets_the_other_process(tmp_path):
 
 
 @pytest.mark.skipif(
-    usable_cores() < 2 or compiler.fcntl is None,
+    usable_cores() < 2 or not cache.can_lock(),
     reason="needs a second processor and files that can be locked",
 )
 def test_an_empty_cache_starts_it(tmp_path):

@@ -11,7 +11,7 @@ import pytest
 import torch
 from numba.core import caching
 
-from backbones.kernels import compiler, threading
+from backbones.kernels import cache, threading
 from backbones.kernels.compiler import (
     cube,
     float32,
@@ -150,24 +150,24 @@ def test_kernels_of_other_versions_are_forgotten(tmp_path):
     stale, foreign = tmp_path / "vm._density-1.py311.nbi", tmp_path / "other.f-1.py311.nbi"
     for file in (stale, foreign):
         file.write_text("x")
-    assert compiler._forget_outdated(str(tmp_path))
+    assert cache.forget_outdated(str(tmp_path))
     assert not stale.exists()
     assert foreign.exists()
     stale.write_text("fresh")
-    compiler._forget_outdated.cache_clear()
-    assert not compiler._forget_outdated(str(tmp_path))
+    cache.forget_outdated.cache_clear()
+    assert not cache.forget_outdated(str(tmp_path))
     assert stale.exists()
 
 
-@pytest.mark.skipif(compiler.fcntl is None, reason="files cannot be locked here")
+@pytest.mark.skipif(not cache.can_lock(), reason="files cannot be locked here")
 def test_one_process_compiles_while_others_wait(tmp_path):
     folder, order = str(tmp_path / "cache"), []
 
     def second():
-        with compiler._one_process(folder, "vm._density"):
+        with cache.one_process(folder, "vm._density"):
             order.append("second")
 
-    with compiler._one_process(folder, "vm._density"):
+    with cache.one_process(folder, "vm._density"):
         # A file opened anew has a lock of its own, as another process has.
         other = Thread(target=second)
         other.start()

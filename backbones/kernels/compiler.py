@@ -20,13 +20,10 @@ of a second, and a slice or a new array in a kernel costs several.
 
 from __future__ import annotations
 
-import contextlib
 import functools
-import hashlib
 import threading
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -37,10 +34,7 @@ from numba.core.caching import FunctionCache
 from numba.core.errors import NumbaWarning
 from numba.np import arrayobj
 
-try:
-    import fcntl
-except ImportError:  # Windows has no such lock.
-    fcntl = None  # type: ignore[assignment]
+from backbones.kernels.cache import can_lock, forget_outdated, one_process
 
 __all__ = [
     "Kernel",
@@ -122,11 +116,11 @@ class Kernel:
             warnings.simplefilter("ignore", NumbaWarning)
             try:
                 folder = self._folder
-                with _one_process(folder, "gridreg-kernels"):
-                    empty = _forget_outdated(folder)
-                if empty and fcntl is not None and self.function.__module__.startswith(__package__):
+                with one_process(folder, "gridreg-kernels"):
+                    empty = forget_outdated(folder)
+                if empty and can_lock() and self.function.__module__.startswith(__package__):
                     _compile_ahead()
-                with _one_process(folder, self.name):
+                with one_process(folder, self.name):
                     return compiled(cache=True)(self.function)
             except (RuntimeError, OSError):
                 # No folder to keep a cache in: neither beside the source nor in the user's.
@@ -142,51 +136,6 @@ def _compile_ahead() -> None:
     from backbones.kernels import ahead
 
     ahead.start()
-
-
-@contextmanager
-def _one_process(folder: str, name: str) -> Iterator[None]:
-    """While one process compiles a kernel, others wait, and then read what it has left in the cache.
-
-    That spares the work; and code that two processes generate may differ in the order of its sums, so that their
-    numbers would differ in the last digits. Where files cannot be locked, each process goes on alone.
-    """
-    Path(folder).mkdir(parents=True, exist_ok=True)
-    with (Path(folder) / f"{name}.lock").open("a") as lock:
-        if fcntl is not None:
-            with contextlib.suppress(OSError):
-                fcntl.flock(lock, fcntl.LOCK_EX)
-        # Closing the file unlocks it.
-        yield
-
-
-@functools.cache
-def _sources() -> tuple[tuple[str, ...], str]:
-    """Names of the modules of this package and the digest of what they say."""
-    files = sorted(Path(__file__).parent.glob("*.py"))
-    digest = hashlib.sha256()
-    for file in files:
-        digest.update(file.read_bytes())
-    return tuple(file.stem for file in files), digest.hexdigest()
-
-
-@functools.cache
-def _forget_outdated(folder: str) -> bool:
-    """Drop cached kernels of other versions of this package; returns whether none are left.
-
-    numba drops a kernel when the kernel's own file changes, not when a function that it calls does in another file.
-    """
-    names, digest = _sources()
-    stamp = Path(folder) / "gridreg-kernels.sha256"
-    if stamp.exists() and stamp.read_text() == digest:
-        return False
-    Path(folder).mkdir(parents=True, exist_ok=True)
-    for name in names:
-        for kind in ("nbi", "lock"):
-            for file in Path(folder).glob(f"{name}.*.{kind}"):
-                file.unlink(missing_ok=True)
-    stamp.write_text(digest)
-    return True
 
 
 def inline(function: Callable[..., Any]) -> Any:
