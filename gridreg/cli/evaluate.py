@@ -5,8 +5,12 @@ from __future__ import annotations
 import sys
 import time
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 from gridreg.cli.arguments import Checkpoint, OptionalFolder
+
+if TYPE_CHECKING:
+    from gridreg.training import LoadedRun
 
 __all__ = ["EvalOptions", "run"]
 
@@ -70,7 +74,8 @@ def run(options: EvalOptions) -> int:
         config=to_data(loaded.config),
         command=["gridreg", *sys.argv[1:]],
         train_views=scene.train.names,
-        uses_alpha=loaded.config.train.carve,
+        uses_alpha=any(run.config.train.carve for run in loaded.members or (loaded,)),
+        **_members(loaded),
     )
     if options.out is not None:
         save_metrics(options.out / "metrics.json", record)
@@ -83,3 +88,9 @@ def run(options: EvalOptions) -> int:
         )
     print(summary(record))
     return 0
+
+
+def _members(run: LoadedRun) -> dict[str, Any]:
+    """Of an ensemble, who belongs to it; nothing for a single run."""
+    members = [{"preset": m.config.preset, "seed": m.config.seed, "steps": m.step} for m in run.members]
+    return {"members": members} if members else {}

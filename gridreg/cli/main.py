@@ -46,6 +46,7 @@ COMMANDS: dict[str, Command] = {
         "gridreg.cli.train:run",
     ),
     "eval": _own("score a checkpoint again", "evaluate", "EvalOptions"),
+    "ensemble": _own("make one run of several: the mean of their fields", "ensemble", "EnsembleOptions"),
     "view": _own("look at a checkpoint in the browser", "view", "ViewOptions"),
     "render": _own("film one checkpoint, or several side by side", "render", "RenderOptions"),
     "mesh": _own("cut a mesh out of a checkpoint", "mesh", "MeshOptions"),

@@ -1,5 +1,6 @@
 """Rays in, pixels out: box intersection, occupancy, march and compositing."""
 
+from gridreg.rendering.ensemble import Ensemble
 from gridreg.rendering.occupancy import OccupancyGrid, visual_hull
 from gridreg.rendering.rays import Rays, box_intersection, camera_rays, pixel_rays
 from gridreg.rendering.render import (
@@ -14,6 +15,7 @@ from gridreg.rendering.render import (
 )
 
 __all__ = [
+    "Ensemble",
     "Field",
     "March",
     "Marched",

@@ -1,12 +1,12 @@
 """The training loop and what it leaves behind: checkpoints, metrics, renders, curves."""
 
+from gridreg.training.ensemble import save_ensemble
 from gridreg.training.execute import Execution, Watch, execute
+from gridreg.training.loading import LoadedRun, load_run
 from gridreg.training.options import TrainOptions, configure, output_folder
 from gridreg.training.presets import load_preset, preset_names
 from gridreg.training.run import (
-    LoadedRun,
     build_trainer,
-    load_run,
     open_scene,
     regularizers_of,
     resume_trainer,
@@ -34,5 +34,6 @@ __all__ = [
     "preset_names",
     "regularizers_of",
     "resume_trainer",
+    "save_ensemble",
     "save_run",
 ]

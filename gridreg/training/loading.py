@@ -1,0 +1,154 @@
+"""Checkpoints read to be looked at: one run, or an ensemble of several."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+import gridreg
+from gridreg.errors import InputError
+from gridreg.fields import make_field
+from gridreg.handle import Handle
+from gridreg.rendering import Ensemble, March, OccupancyGrid
+from gridreg.training import events
+from gridreg.training.checkpoint import has_checkpoint, load_checkpoint
+from gridreg.training.config import from_data
+from gridreg.training.rays import NdcWarp
+from gridreg.training.run import regularizers_of
+from gridreg.training.settings import RunConfig
+from gridreg.training.trainer import load_field
+
+__all__ = ["LoadedRun", "checkpoint_of", "ensemble_of", "load_run", "members_in"]
+
+
+@dataclass(frozen=True)
+class LoadedRun:
+    """A trained field and all it takes to render it.
+
+    Args:
+        field: in eval mode.
+        occupancy: cells that may hold something.
+        march: step and range of the rays.
+        background: ``(3,)`` colour behind the field.
+        config: of the run; of an ensemble, the first member's.
+        step: iterations done; of an ensemble, the fewest of its members'.
+        handle: of the regularizers; masks that are not fully open act only as long as it is kept. None for an ensemble,
+            whose members have theirs.
+        fingerprint: of the scene it was trained on, see `gridreg.scenes.Scene`.
+        warp: maps rays of cameras to the field's coordinates; None: these are the world's.
+        members: the runs that an ensemble is made of, else none.
+    """
+
+    field: Any
+    occupancy: OccupancyGrid
+    march: March
+    background: torch.Tensor
+    config: RunConfig
+    step: int
+    handle: Handle | None
+    fingerprint: str
+    warp: NdcWarp | None = None
+    members: tuple[LoadedRun, ...] = ()
+
+
+def checkpoint_of(folder: str | Path) -> Path:
+    """The checkpoint in the output folder of a run, or the folder itself if it is one.
+
+    Raises:
+        InputError: if there is a folder without any.
+    """
+    path = Path(folder)
+    if has_checkpoint(path / "checkpoint"):
+        return path / "checkpoint"
+    if path.is_dir() and not (path / "state.json").exists() and not (path / "tensors.safetensors").exists():
+        raise InputError(f"{path}: holds no checkpoint, expected the output folder of a run")
+    return path
+
+
+def members_in(path: Path) -> tuple[list[dict[str, Any]], bool, str]:
+    """What a checkpoint says of each run in it, ``{"config": ..., "state": ...}``.
+
+    Returns:
+        One entry for each run; whether it is an ensemble; the fingerprint of the scene.
+
+    Raises:
+        InputError: of `load_checkpoint`.
+    """
+    saved = load_checkpoint(path)
+    if "members" in saved.state:
+        return list(saved.state["members"]), True, saved.fingerprint
+    return [{"config": saved.config, "state": saved.state}], False, saved.fingerprint
+
+
+def load_run(folder: str | Path) -> LoadedRun:
+    """Read a checkpoint for rendering, without its scene.
+
+    Args:
+        folder: a checkpoint, or an output folder that holds one, of a run or of an ensemble.
+
+    Raises:
+        InputError: if there is none, or it is damaged.
+    """
+    path = checkpoint_of(folder)
+    members, joined, fingerprint = members_in(path)
+    runs = [_run(member["config"], member["state"], fingerprint, str(path)) for member in members]
+    return ensemble_of(runs) if joined else runs[0]
+
+
+def ensemble_of(runs: Sequence[LoadedRun]) -> LoadedRun:
+    """Runs of one scene as one, see `gridreg.rendering.Ensemble`; rays are walked at the shortest step of any.
+
+    Args:
+        runs: with equal fingerprint, background and warp.
+
+    Raises:
+        InputError: without runs.
+    """
+    field = Ensemble([run.field for run in runs], [run.occupancy for run in runs]).eval()
+    march = replace(runs[0].march, step=min(run.march.step for run in runs))
+    step = min(run.step for run in runs)
+    return replace(
+        runs[0],
+        field=field,
+        occupancy=field.occupancy(),
+        march=march,
+        step=step,
+        handle=None,
+        members=tuple(runs),
+    )
+
+
+def _run(plain: Any, state: dict[str, Any], fingerprint: str, source: str) -> LoadedRun:
+    config = from_data(RunConfig, plain, source=source)
+    trainer = state["trainer"]
+    bounds, resolution = trainer["field"]["bounds"], tuple(trainer["resolution"]) or (128,) * 3
+    field = make_field(config.backbone, bounds, resolution, **config.field)
+    load_field(field, trainer)
+    # Masks that are not yet open are part of what was trained.
+    handle = gridreg.apply(field, *regularizers_of(config), total_steps=config.train.steps, seed=config.seed)
+    handle.load_state_dict(trainer["handle"])
+    handle.step(min(int(trainer["step"]), config.train.steps))
+    field.eval()
+    march = events.march_of(field, config.train, state["march"]["near"], state["march"]["far"])
+    return LoadedRun(
+        field,
+        OccupancyGrid(**trainer["occupancy"]),
+        march,
+        state["background"],
+        config,
+        int(trainer["step"]),
+        handle,
+        fingerprint,
+        _saved_warp(state.get("warp")),
+    )
+
+
+def _saved_warp(saved: dict[str, Any] | None) -> NdcWarp | None:
+    if saved is None:
+        return None
+    fx, fy, cx, cy = saved["intrinsics"]
+    return NdcWarp((fx, fy, cx, cy), saved["height"], saved["width"])

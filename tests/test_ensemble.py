@@ -1,0 +1,213 @@
+"""Several runs as one: the mean of fields, its checkpoint, and the command that writes it."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from gridreg.cli import main
+from gridreg.errors import InputError
+from gridreg.export import model_of_run
+from gridreg.export.preview import Preview
+from gridreg.rendering import Ensemble, March, OccupancyGrid, Rays, render_rays
+from gridreg.scenes import builtin_scene, load_scene
+from gridreg.training import RunConfig, TrainSettings, execute, load_run, save_ensemble
+
+BOX = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+FIELD = {"density_components": 4, "appearance_components": 4, "decoder": "sh"}
+
+
+class Flat(nn.Module):
+    """The same density and colour everywhere."""
+
+    def __init__(self, density: float, colour: tuple[float, float, float], bounds: Tensor = BOX) -> None:
+        super().__init__()
+        self.value, self.shade = nn.Parameter(torch.tensor(density)), torch.tensor(colour)
+        self.bounds = bounds
+
+    def density(self, x: Tensor) -> Tensor:
+        return self.value.expand(len(x))
+
+    def colour(self, x: Tensor, d: Tensor) -> Tensor:
+        return self.shade.expand(len(x), 3)
+
+
+def full(bounds: Tensor = BOX, cells: int = 4) -> OccupancyGrid:
+    return OccupancyGrid.full(bounds, (cells, cells, cells))
+
+
+def test_density_is_the_mean_and_colour_is_mixed_by_density():
+    field = Ensemble([Flat(3.0, (1.0, 0.0, 0.0)), Flat(1.0, (0.0, 1.0, 0.0))], [full(), full()])
+    x = torch.zeros(2, 3)
+    assert field.density(x).tolist() == [2.0, 2.0]
+    torch.testing.assert_close(field.colour(x, x), torch.tensor([0.75, 0.25, 0.0]).expand(2, 3))
+
+
+def test_where_nothing_is_colour_is_the_plain_mean():
+    field = Ensemble([Flat(0.0, (1.0, 0.0, 0.0)), Flat(0.0, (0.0, 1.0, 0.0))], [full(), full()])
+    assert field.colour(torch.zeros(1, 3), torch.zeros(1, 3)).tolist() == [[0.5, 0.5, 0.0]]
+
+
+def test_an_ensemble_of_one_renders_as_its_member():
+    member = Flat(1.5, (0.2, 0.4, 0.6))
+    rays = Rays(torch.tensor([[0.0, 0.1, -3.0]]), torch.tensor([[0.0, 0.0, 1.0]]))
+    march, black = March(0.1), torch.zeros(3)
+    alone = render_rays(member, rays, full(), march, background=black)
+    joined = render_rays(Ensemble([member], [full()]), rays, full(), march, background=black)
+    torch.testing.assert_close(joined.colour, alone.colour)
+    torch.testing.assert_close(joined.depth, alone.depth)
+
+
+def test_members_have_nothing_outside_their_cells_and_boxes():
+    small = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 2.0]])
+    half = full(small, 2)
+    half.cells[0] = 0
+    field = Ensemble([Flat(2.0, (1.0, 0.0, 0.0)), Flat(4.0, (0.0, 0.0, 1.0), small)], [full(), half])
+    assert field.bounds.tolist() == [[-1.0, -1.0, -1.0], [1.0, 1.0, 2.0]]
+    x = torch.tensor(
+        [[-0.5, 0.5, 0.5], [0.25, 0.5, 0.5], [0.75, 0.5, 0.5], [0.75, 0.5, 1.5], [-0.5, 0.0, 1.5]]
+    )
+    assert field.density(x).tolist() == [1.0, 1.0, 3.0, 2.0, 0.0]
+    torch.testing.assert_close(
+        field.colour(x[2:4], x[2:4]), torch.tensor([[1 / 3, 0, 2 / 3], [0.0, 0.0, 1.0]])
+    )
+    cells = field.occupancy()
+    assert cells.resolution == (4, 4, 4)
+    assert cells.contains(x).tolist() == [True, True, True, True, False]
+
+
+def test_gradients_reach_every_member():
+    first, second = Flat(3.0, (1.0, 0.0, 0.0)), Flat(1.0, (0.0, 1.0, 0.0))
+    field = Ensemble([first, second], [full(), full()])
+    x = torch.zeros(1, 3)
+    (field.density(x).sum() + field.colour(x, x)[:, 0].sum()).backward()
+    # Density: 1/2 each. Red is a / (a + b): b / (a + b)^2 and -a / (a + b)^2.
+    assert first.value.grad == pytest.approx(0.5 + 1 / 16)
+    assert second.value.grad == pytest.approx(0.5 - 3 / 16)
+
+
+def test_members_and_cells_must_match():
+    with pytest.raises(InputError, match="found 0 members"):
+        Ensemble([], [])
+    with pytest.raises(InputError, match="found 1 members with 2 occupancies"):
+        Ensemble([Flat(1.0, (0.0, 0.0, 0.0))], [full(), full()])
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Runs `a`, `b` (another seed, closed masks) and `c` (another scene)."""
+    folder = tmp_path_factory.mktemp("ensembles")
+    settings = TrainSettings(
+        steps=40,
+        rays=128,
+        voxels_start=4096,
+        voxels_end=8000,
+        resample_at=(20,),
+        occupancy_at=(30,),
+        occupancy_every=0,
+        occupancy_resolution=24,
+        shrink_at=(30,),
+        learning_rate_grid=0.1,
+    )
+    for name, seed, size, composition in (
+        ("a", 0, 32, []),
+        ("b", 1, 32, [{"name": "FixedMask", "site": "density", "visible_ratio": 0.5}]),
+        ("c", 0, 24, []),
+    ):
+        place = builtin_scene(folder / "scenes", size=size)
+        config = RunConfig(
+            scene=str(place), seed=seed, backbone="vm", field=FIELD, train=settings, composition=composition
+        )
+        execute(config, load_scene(place, "builtin8"), folder / name)
+    return folder
+
+
+def test_a_saved_ensemble_is_the_mean_of_its_runs(desk, tmp_path):
+    assert save_ensemble([desk / "a", desk / "b" / "checkpoint"], tmp_path / "both") == 2
+    one, other, both = load_run(desk / "a"), load_run(desk / "b"), load_run(tmp_path / "both")
+    assert both.fingerprint == one.fingerprint
+    assert both.step == 40
+    assert both.handle is None
+    assert [run.config.seed for run in both.members] == [0, 1]
+    assert both.march.step == min(one.march.step, other.march.step)
+    low, high = both.field.bounds
+    x = low + torch.rand(4000, 3, generator=torch.Generator().manual_seed(0)) * (high - low)
+    parts = [torch.where(run.occupancy.contains(x), run.field.density(x), 0.0) for run in (one, other)]
+    torch.testing.assert_close(both.field.density(x), (parts[0] + parts[1]) / 2)
+    assert both.occupancy.contains(x)[one.occupancy.contains(x) | other.occupancy.contains(x)].all()
+    # The mask of the second is half closed, and part of what it is.
+    other.handle.remove()
+    assert not torch.equal(torch.where(other.occupancy.contains(x), other.field.density(x), 0.0), parts[1])
+
+
+def test_the_checkpoint_is_smaller_than_its_runs(desk, tmp_path):
+    save_ensemble([desk / "a", desk / "b"], tmp_path)
+    size = sum((desk / name / "checkpoint" / "tensors.safetensors").stat().st_size for name in ("a", "b"))
+    assert (tmp_path / "checkpoint" / "tensors.safetensors").stat().st_size < 0.6 * size
+
+
+def test_ensembles_join_by_their_members(desk, tmp_path):
+    save_ensemble([desk / "a", desk / "b"], tmp_path / "two")
+    assert save_ensemble([tmp_path / "two", desk / "a"], tmp_path / "three") == 3
+    assert [run.config.seed for run in load_run(tmp_path / "three").members] == [0, 1, 0]
+
+
+def test_a_viewer_copies_it_masks_included(desk, tmp_path):
+    save_ensemble([desk / "a", desk / "b"], tmp_path)
+    run = load_run(tmp_path)
+    preview = Preview(model_of_run(run))
+    assert preview.masks == ()
+    x = run.field.bounds.mean(0) + 0.3 * torch.randn(200, 3, generator=torch.Generator().manual_seed(0))
+    assert torch.equal(preview.at().field.density(x), run.field.density(x))
+
+
+def test_runs_that_do_not_go_together(desk, tmp_path):
+    with pytest.raises(InputError, match="ensemble: found 1 run, expected at least two"):
+        save_ensemble([desk / "a"], tmp_path / "x")
+    with pytest.raises(InputError, match=r"c: trained on another scene than .*a \(fingerprint"):
+        save_ensemble([desk / "a", desk / "c"], tmp_path / "x")
+    with pytest.raises(InputError, match="holds no checkpoint"):
+        save_ensemble([desk / "a", desk / "scenes"], tmp_path / "x")
+    assert not (tmp_path / "x" / "checkpoint").exists()
+    before = (desk / "b" / "checkpoint" / "state.json").read_bytes()
+    with pytest.raises(InputError, match="holds a run already"):
+        save_ensemble([desk / "a", desk / "b"], desk / "b")
+    assert (desk / "b" / "checkpoint" / "state.json").read_bytes() == before
+
+
+def test_an_ensemble_cannot_be_resumed(desk, tmp_path):
+    save_ensemble([desk / "a", desk / "b"], tmp_path)
+    config = load_run(desk / "a").config
+    scene = load_scene(Path(config.scene or ""), "builtin8")
+    with pytest.raises(InputError, match="an ensemble, which cannot be trained; resume its members"):
+        execute(replace(config), scene, tmp_path, resume=True)
+
+
+def test_the_command_and_those_that_read_what_it_wrote(desk, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(desk)
+    out = os.fspath(tmp_path / "joined")
+    assert main(["ensemble", "a", "b", "--out", out]) == 0
+    assert "the mean of 2 fields" in capsys.readouterr().out
+    assert main(["eval", out, "--out", f"{out}/score"]) == 0
+    record = json.loads((tmp_path / "joined" / "score" / "metrics.json").read_text())
+    assert record["members"] == [
+        {"preset": "", "seed": 0, "steps": 40},
+        {"preset": "", "seed": 1, "steps": 40},
+    ]
+    assert np.isfinite(record["mean"]["psnr"])
+    assert main(["render", out, "--frames", "2", "--width", "16", "--out", f"{out}/film"]) == 0
+    assert len(list((tmp_path / "joined" / "film").glob("*.png"))) == 2
+    assert main(["mesh", out, "--resolution", "24", "--threshold", "0.5"]) == 0
+    assert (tmp_path / "joined" / "mesh.ply").exists()
+    capsys.readouterr()
+    assert main(["ensemble", "a", "c", "--out", f"{out}2"]) == 2
+    text = capsys.readouterr().err
+    assert text.startswith("error: c: trained on another scene than a")
+    assert len(text.splitlines()) == 1
