@@ -19,6 +19,7 @@ from results_text import (
     BODIES,
     BODY_METHODS,
     CLAIMS,
+    ENSEMBLES,
     HEAD,
     METHODS,
     PICTURES,
@@ -34,6 +35,7 @@ from gridreg.training.files import write_text
 PAGE = Path(__file__).with_name("results.md")
 STUDY_STORE = Path(__file__).parent.parent / "benchmarks" / "results"
 STORE = STUDY_STORE / "quality"
+ENSEMBLE_STORE = STUDY_STORE / "ensembles"
 
 
 def records_in(folder: Path) -> list[dict[str, Any]]:
@@ -188,6 +190,25 @@ def study_table(records: Sequence[dict[str, Any]]) -> str:
     return table(head, [*first, *(row for _, row in compared)])
 
 
+def ensembles(folder: Path = ENSEMBLE_STORE) -> str:
+    """Seeds joined beside the seeds alone; nothing without any."""
+    rows = []
+    for record in records_in(folder):
+        alone = [psnr(member) for member in record["members"]]
+        rows.append(
+            [
+                f"`{record['run']}`, {record['scene']}, {record['protocol']}",
+                ", ".join(str(member["seed"]) for member in record["members"]),
+                ", ".join(f"{value:.2f}" for value in alone),
+                f"{psnr(record):.2f}", signed(psnr(record) - sum(alone) / len(alone)), f"{ssim(record):.3f}",
+            ]
+        )  # fmt: skip
+    if not rows:
+        return ""
+    head = ["runs", "seeds", "each alone (dB)", "joined (dB)", "gain over their mean (dB)", "SSIM 11x11"]
+    return "\n## Several seeds as one\n\n" + ENSEMBLES + table(head, rows)
+
+
 def beside_plain(folder: Path = STORE) -> str:
     """The compiled path beside the plain one, of runs that have both, by seed; nothing without any."""
     found: dict[tuple[str, str, str, int, int], dict[str, dict[str, Any]]] = {}
@@ -258,6 +279,7 @@ def page(runs: Runs) -> str:
         bodies(runs),
         "\n## Claims\n\n",
         claims(runs),
+        ensembles(),
         beside_plain(),
         PICTURES,
         study_tables(),

@@ -54,6 +54,11 @@ BODY_METHODS = (
     ("`human`, 8 views", "human8", "human"),
 )
 
+ENSEMBLES = """The mean of the fields of several seeds (`gridreg ensemble`), scored on the same test views by
+`benchmarks/ensembles.py`. Training takes as long as that of its members.
+
+"""
+
 STUDIES = (
     (
         "occlusion_near",

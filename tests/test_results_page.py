@@ -89,6 +89,14 @@ def test_studies_are_compared_with_their_baseline(results: ModuleType, tmp_path:
     ]
 
 
+def test_ensembles_stand_beside_their_members(results: ModuleType, tmp_path: Path) -> None:
+    assert results.ensembles(tmp_path) == ""
+    members = [{"seed": seed, "mean": {"psnr": psnr}} for seed, psnr in ((0, 28.0), (2, 29.0))]
+    store(tmp_path, "best", "lego", 0, 29.25, members=members)
+    rows = [line for line in results.ensembles(tmp_path).splitlines() if line.startswith("| `best`")]
+    assert rows == ["| `best`, lego, dietnerf8 | 0, 2 | 28.00, 29.00 | 29.25 | +0.75 | 0.900 |"]
+
+
 def test_paths_are_compared_at_equal_steps_and_seeds(results: ModuleType, tmp_path: Path) -> None:
     assert results.beside_plain(tmp_path) == ""
     plain = ["quality.py", "--steps", "150", "--backend", "torch"]

@@ -1,0 +1,99 @@
+"""The benchmark of joined seeds: what it stores, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from gridreg.errors import InputError
+from gridreg.scenes import builtin_scene, load_scene
+from gridreg.training import RunConfig, TrainSettings, execute
+from tests.programs import ROOT, module_at
+
+FIELD = {"density_components": 4, "appearance_components": 4, "decoder": "sh"}
+SETTINGS = TrainSettings(
+    steps=30,
+    rays=128,
+    voxels_start=4096,
+    resample_at=(),
+    occupancy_at=(20,),
+    occupancy_every=0,
+    occupancy_resolution=24,
+    shrink_at=(),
+    learning_rate_grid=0.1,
+)
+
+
+@pytest.fixture(scope="module")
+def program() -> ModuleType:
+    return module_at(ROOT / "benchmarks" / "ensembles.py")
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A scene, and the folder of three seeds as benchmarks/quality.py --keep leaves it."""
+    folder = tmp_path_factory.mktemp("kept")
+    place = builtin_scene(tmp_path_factory.mktemp("data"), size=32)
+    scene = load_scene(place, "builtin8")
+    for seed in range(3):
+        config = RunConfig(
+            scene=str(place),
+            protocol="builtin8",
+            seed=seed,
+            backbone="vm",
+            field=FIELD,
+            train=SETTINGS,
+            composition=[],
+        )
+        execute(config, scene, folder / f"{place.name}-builtin8-small-seed{seed}")
+    return place, folder
+
+
+def words(kept: tuple[Path, Path], results: Path, *more: str) -> list[str]:
+    place, folder = kept
+    return [
+        *("--data", str(place.parent), "--kept", str(folder), "--scenes", place.name, "--runs", "small"),
+        *("--protocol", "builtin8", "--results", str(results), *more),
+    ]
+
+
+def test_two_seeds_then_three(program: ModuleType, kept: tuple[Path, Path], tmp_path: Path) -> None:
+    assert program.main(words(kept, tmp_path)) == 0
+    name = f"{kept[0].name}-builtin8-small-seeds"
+    assert {path.name for path in tmp_path.iterdir()} == {f"{name}0,1.json", f"{name}0,1,2.json"}
+    record = json.loads((tmp_path / f"{name}0,1,2.json").read_text())
+    alone = [
+        json.loads((kept[1] / f"{kept[0].name}-builtin8-small-seed{seed}" / "metrics.json").read_text())
+        for seed in range(3)
+    ]
+    assert [member["seed"] for member in record["members"]] == [0, 1, 2]
+    assert [member["mean"] for member in record["members"]] == [one["mean"] for one in alone]
+    assert record["seconds"]["train"] == pytest.approx(sum(one["seconds"]["train"] for one in alone))
+    assert set(record["images"]) == set(alone[0]["images"])
+    assert record["config"]["scene"] == kept[0].name
+    # The mean of three fields that agree in part is no worse than the worst of them.
+    assert record["mean"]["psnr"] > min(one["mean"]["psnr"] for one in alone)
+
+
+def test_what_is_stored_is_not_computed_again(
+    program: ModuleType, kept: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stored = tmp_path / f"{kept[0].name}-builtin8-small-seeds0,1.json"
+    stored.write_text("{}")
+    assert program.main(words(kept, tmp_path, "--seeds", "0", "1")) == 0
+    assert stored.read_text() == "{}"
+    assert capsys.readouterr().out == ""
+
+
+def test_runs_that_are_missing_and_one_seed(
+    program: ModuleType, kept: tuple[Path, Path], tmp_path: Path
+) -> None:
+    with pytest.raises(
+        InputError, match=r"found no finished run, expected what benchmarks/quality\.py --keep leaves"
+    ):
+        program.main(words(kept, tmp_path, "--seeds", "0", "7"))
+    with pytest.raises(InputError, match="--seeds: found 1, expected at least two"):
+        program.main(words(kept, tmp_path, "--seeds", "0"))
