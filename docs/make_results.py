@@ -7,14 +7,27 @@ python docs/make_results.py --check    exit with status 1 if the page is stale
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent))
+from results_runs import (
+    ENSEMBLE_STORE,
+    STORE,
+    STUDY_STORE,
+    Runs,
+    minutes,
+    psnr,
+    records_in,
+    ssim,
+    table,
+    threads,
+    with_interval,
+    with_spread,
+)
 from results_text import (
     BODIES,
     BODY_METHODS,
@@ -28,90 +41,11 @@ from results_text import (
     STUDIES,
 )
 
-from gridreg.ablation.statistics import Estimate, estimate
+from gridreg.ablation.statistics import estimate
 from gridreg.ablation.tables import signed
 from gridreg.training.files import write_text
 
 PAGE = Path(__file__).with_name("results.md")
-STUDY_STORE = Path(__file__).parent.parent / "benchmarks" / "results"
-STORE = STUDY_STORE / "quality"
-ENSEMBLE_STORE = STUDY_STORE / "ensembles"
-
-
-def records_in(folder: Path) -> list[dict[str, Any]]:
-    """All stored runs of a folder, in the order of their names."""
-    return [json.loads(path.read_text(encoding="utf-8")) for path in sorted(folder.glob("*.json"))]
-
-
-class Runs:
-    """The stored runs, by scene, protocol, run and seed; shortened and changed runs are left out."""
-
-    def __init__(self, folder: Path = STORE) -> None:
-        self.records: dict[tuple[str, str, str], dict[int, dict[str, Any]]] = {}
-        for record in records_in(folder):
-            if "--steps" in record["command"] or record["changes"]:
-                continue
-            key = (record["scene"], record["protocol"], record["run"])
-            self.records.setdefault(key, {})[record["seed"]] = record
-
-    def of(self, scene: str, protocol: str, run: str) -> dict[int, dict[str, Any]]:
-        """Records by seed."""
-        return self.records.get((scene, protocol, run), {})
-
-    def mean(
-        self, scene: str, protocol: str, run: str, pick: Callable[[dict[str, Any]], float]
-    ) -> Estimate | None:
-        """Mean over seeds of a figure; None without a run."""
-        found = [pick(record) for record in self.of(scene, protocol, run).values()]
-        return estimate(found) if found else None
-
-    def gains(self, scenes: Sequence[str], protocol: str, run: str, base: str) -> list[float]:
-        """Differences of PSNR (dB) of two runs, over the pairs of scene and seed that both have."""
-        pairs = []
-        for scene in scenes:
-            ours, theirs = self.of(scene, protocol, run), self.of(scene, protocol, base)
-            pairs += [psnr(ours[seed]) - psnr(theirs[seed]) for seed in sorted(ours.keys() & theirs.keys())]
-        return pairs
-
-
-def psnr(record: dict[str, Any]) -> float:
-    """Mean PSNR, dB."""
-    return float(record["mean"]["psnr"])
-
-
-def ssim(record: dict[str, Any]) -> float:
-    """Mean SSIM, Gaussian windows."""
-    return float(record["mean"]["ssim_gaussian"])
-
-
-def minutes(record: dict[str, Any]) -> float:
-    """Of training."""
-    return float(record["seconds"]["train"]) / 60
-
-
-def threads(records: dict[int, dict[str, Any]]) -> str:
-    """How many each run had."""
-    return "/".join(map(str, sorted({record["versions"]["threads"] for record in records.values()})))
-
-
-def with_spread(found: Estimate | None, digits: int = 2) -> str:
-    """``25.10 ± 0.20 (3)``, ``25.10 (1)`` or a dash."""
-    if found is None:
-        return "–"
-    spread = "" if found.half_width is None else f" ± {found.half_width:.{digits}f}"
-    return f"{found.mean:.{digits}f}{spread} ({found.count})"
-
-
-def with_interval(found: Estimate) -> str:
-    """``−0.04 [−0.14, +0.06]``, or the mean of one pair alone."""
-    spread = "" if found.half_width is None else f" [{signed(found.low)}, {signed(found.high)}]"
-    return f"{signed(found.mean)}{spread}"
-
-
-def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Markdown."""
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
 
 
 def few_shot(runs: Runs, protocol: str) -> str:
