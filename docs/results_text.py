@@ -93,6 +93,12 @@ STUDIES = (
         "together.",
     ),
     (
+        "best_cells",
+        "Cells, harmonics, and the end of `best`",
+        "Finer cells for the hull and the march and learning rates that fall less change less than seeds do; colour "
+        "from spherical harmonics instead of a network loses.",
+    ),
+    (
         "best_pieces",
         "Pieces of `best` as it was",
         "An earlier `best`, with masks and 2,500 iterations in full, one piece left out at a time.",

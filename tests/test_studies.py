@@ -68,6 +68,10 @@ ROWS = {
         "best", "no direction", "direction without octaves", "features without octaves", "dropout of the direction",
         "no small pieces",
     ],
+    "best_cells": [
+        "best", "cells of 240", "cells of 320", "spherical harmonics", "rates fall to 0.3",
+        "rates fall to 0.3 mean of the last half", "rates stay mean of the last half",
+    ],
     "occlusion_near": [
         "none", "20 samples from the box", "0.625 from the near plane", "20 samples until the box shrinks",
     ],
