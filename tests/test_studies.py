@@ -68,6 +68,10 @@ ROWS = {
         "best", "no direction", "direction without octaves", "features without octaves", "dropout of the direction",
         "no small pieces",
     ],
+    "best_full": ["best", "distortion 0.01", "learning rate of grids 0.04", "total variation 0.006"],
+    "best_opaque": [
+        "best without alpha", "no occlusion loss", "no L1", "no distortion", "occlusion loss 0.01",
+    ],
     "best_cells": [
         "best", "cells of 240", "cells of 320", "spherical harmonics", "rates fall to 0.3",
         "rates fall to 0.3 mean of the last half", "rates stay mean of the last half",
