@@ -1,7 +1,7 @@
-"""Write docs/results.md, the figures of the papers beside ours, from the runs stored in benchmarks/results/quality.
+"""Write docs/results.md and the table in README.md from the runs stored in benchmarks/results.
 
-python docs/make_results.py            write the page
-python docs/make_results.py --check    exit with status 1 if the page is stale
+python docs/make_results.py            write both
+python docs/make_results.py --check    exit with status 1 if one is stale
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ from results_text import (
     BODY_METHODS,
     CLAIMS,
     ENSEMBLES,
+    FRONT,
     HEAD,
     METHODS,
     PICTURES,
@@ -46,6 +47,8 @@ from gridreg.ablation.tables import signed
 from gridreg.training.files import write_text
 
 PAGE = Path(__file__).with_name("results.md")
+README = PAGE.parents[1] / "README.md"
+BEGIN, END = "<!-- results: begin -->", "<!-- results: end -->"
 
 
 def few_shot(runs: Runs, protocol: str) -> str:
@@ -221,6 +224,44 @@ def page(runs: Runs) -> str:
     return "".join(parts)
 
 
+def front_table(runs: Runs, ensemble_store: Path = ENSEMBLE_STORE) -> str:
+    """What README.md shows: PSNR, SSIM and minutes of some runs under `dietnerf8`, and the seeds joined."""
+    rows = []
+    for run, about in FRONT:
+        cells = []
+        for scene in SCENES:
+            seen = runs.mean(scene, "dietnerf8", run, ssim)
+            taken = runs.mean(scene, "dietnerf8", run, minutes)
+            if seen is None or taken is None:
+                cells.append("–")
+                continue
+            quality = with_spread(runs.mean(scene, "dietnerf8", run, psnr))
+            count = threads(runs.of(scene, "dietnerf8", run))
+            cells.append(f"{quality} / {seen.mean:.3f} / {taken.mean:.1f}; {count}")
+        rows.append([f"`{run}`{about}", *cells])
+    joined: dict[str, dict[str, dict[str, Any]]] = {}
+    for record in records_in(ensemble_store):
+        if record["protocol"] == "dietnerf8":
+            name = f"{len(record['members'])} seeds of `{record['run']}` joined"
+            joined.setdefault(name, {})[record["scene"]] = record
+    for name, found in joined.items():
+        cells = [
+            f"{psnr(found[scene]):.2f} / {ssim(found[scene]):.3f}" if scene in found else "–"
+            for scene in SCENES
+        ]
+        rows.append([name, *cells])
+    return table(["run", *(f"{scene}: PSNR (seeds) / SSIM / minutes; threads" for scene in SCENES)], rows)
+
+
+def with_front(readme: str, runs: Runs) -> str:
+    """README.md with its table renewed, between the marks around it."""
+    before, begin, rest = readme.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not begin or not end:
+        raise ValueError(f"README.md: found no table between {BEGIN!r} and {END!r}")
+    return f"{before}{begin}\n{front_table(runs)}{end}{after}"
+
+
 def main(words: Sequence[str] | None = None) -> int:
     """Write or check the page."""
     parser = argparse.ArgumentParser(
@@ -228,12 +269,15 @@ def main(words: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--check", action="store_true", help="only say whether the page is up to date")
     arguments = parser.parse_args(words)
-    text = page(Runs())
+    runs = Runs()
+    told = README.read_text(encoding="utf-8")
+    written = {PAGE: page(runs), README: with_front(told, runs)}
     if arguments.check:
-        fresh = PAGE.is_file() and PAGE.read_text(encoding="utf-8") == text
-        print(f"{PAGE.name}: {'up to date' if fresh else 'stale; run python docs/make_results.py'}")
-        return 0 if fresh else 1
-    write_text(PAGE, text)
+        stale = [path.name for path, text in written.items() if path.read_text(encoding="utf-8") != text]
+        print(f"{', '.join(stale)}: stale; run python docs/make_results.py" if stale else "up to date")
+        return 1 if stale else 0
+    for path, text in written.items():
+        write_text(path, text)
     return 0
 
 

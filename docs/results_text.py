@@ -54,6 +54,17 @@ BODY_METHODS = (
     ("`human`, 8 views", "human8", "human"),
 )
 
+FRONT = (
+    ("best", ", 3,000 iterations"),
+    ("best-long", ", 12,000 iterations"),
+    ("quick", ", 1,200 iterations, 200^3"),
+    ("tensorf", ", 15,000 iterations"),
+    ("few_tensorf_finetuned", ", 10,000 iterations"),
+    ("few_tensorf_10k", ", its fine-tuned row as published"),
+    ("few_tensorf", ", 15,000 iterations"),
+)
+"""Runs that README.md shows, and what it says of each."""
+
 ENSEMBLES = """The mean of the fields of several seeds (`gridreg ensemble`), scored on the same test views by
 `benchmarks/ensembles.py`. Training takes as long as that of its members.
 

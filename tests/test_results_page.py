@@ -97,6 +97,25 @@ def test_ensembles_stand_beside_their_members(results: ModuleType, tmp_path: Pat
     assert rows == ["| `best`, lego, dietnerf8 | 0, 2 | 28.00, 29.00 | 29.25 | +0.75 | 0.900 |"]
 
 
+def test_the_readme_has_the_same_figures(results: ModuleType, tmp_path: Path) -> None:
+    runs, joined = tmp_path / "runs", tmp_path / "joined"
+    runs.mkdir()
+    joined.mkdir()
+    store(runs, "best", "chair", 0, 30.0)
+    store(joined, "best", "chair", 0, 30.5, members=[{}, {}])
+    text = results.front_table(results.Runs(runs), joined)
+    assert "| `best`, 3,000 iterations | – | 30.00 (1) / 0.900 / 2.0; 2 |" in text
+    assert "| `tensorf`, 15,000 iterations | – | – |" in text
+    assert text.endswith("| 2 seeds of `best` joined | – | 30.50 / 0.900 |\n")
+    told = f"Before.\n{results.BEGIN}\nold\n{results.END}\nAfter.\n"
+    renewed = results.with_front(told, results.Runs(runs))
+    assert renewed.startswith(f"Before.\n{results.BEGIN}\n| run |")
+    assert renewed.endswith(f"|\n{results.END}\nAfter.\n")
+    assert "old" not in renewed
+    with pytest.raises(ValueError, match="found no table between"):
+        results.with_front("Nothing.", results.Runs(runs))
+
+
 def test_paths_are_compared_at_equal_steps_and_seeds(results: ModuleType, tmp_path: Path) -> None:
     assert results.beside_plain(tmp_path) == ""
     plain = ["quality.py", "--steps", "150", "--backend", "torch"]
