@@ -104,6 +104,12 @@ STUDIES = (
         "together.",
     ),
     (
+        "best_full",
+        "Changes to `best` at its full length",
+        "Distortion three times as strong helps chair and costs lego; slower learning and stronger total variation "
+        "change little.",
+    ),
+    (
         "best_cells",
         "Cells, harmonics, and the end of `best`",
         "Finer cells for the hull and the march and learning rates that fall less change less than seeds do; colour "
