@@ -47,8 +47,9 @@ ROWS = {
         "cheaper, mean of the last fifth",
     ],
     "best_leave_one_out": [
-        "best", "no distortion", "no occlusion loss", "no L1", "no total variation", "no random background",
-        "no carving", "no mean of the last fifth", "slower learning as in TensoRF", "no L1 and no occlusion loss",
+        "best", "no distortion", "no occlusion loss", "no L1", "no L1 and no occlusion loss", "no total variation",
+        "no random background",
+        "no carving", "no mean of the last fifth", "slower learning as in TensoRF",
     ],
     "finetuned_search": [
         "as it is", "no masks", "masks until 0.2", "masks on encodings alone", "total variation in every iteration",
