@@ -15,6 +15,7 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -23,8 +24,8 @@ from error_pictures import kept
 
 from gridreg.cli import ending
 from gridreg.errors import InputError
-from gridreg.scenes import load_scene
-from gridreg.training import load_run
+from gridreg.scenes import Scene, load_scene
+from gridreg.training import LoadedRun, load_run
 from gridreg.training.config import to_data
 from gridreg.training.evaluate import score_views
 from gridreg.training.files import write_json
@@ -34,27 +35,51 @@ from gridreg.training.record import metrics_record
 RESULTS = Path(__file__).parent / "results" / "ensembles"
 
 
-def score(folder: Path, run: str, seeds: Sequence[int], protocol: str, runs: Path, results: Path) -> Path:
-    """Join the kept runs of some seeds, score them on the protocol's test views, and store it.
+def score(folder: Path, run: str, seeds: Sequence[int], protocol: str, runs: Path, results: Path) -> None:
+    """Join the first two kept runs, then three, and so on; score each on the protocol's test views, and store it.
 
     Raises:
         InputError: if a run is not kept, or was trained on other pictures.
     """
-    joined = ",".join(map(str, seeds))
-    target = results / f"{folder.name}-{protocol}-{run.replace(':', '+')}-seeds{joined}.json"
-    if target.exists():
-        return target
+    counts = [
+        n
+        for n in range(2, len(seeds) + 1)
+        if not place_of(folder.name, run, seeds[:n], protocol, results).exists()
+    ]
+    if not counts:
+        return
     places = [kept(runs, folder.name, run, seed, protocol) for seed in seeds]
     scene = load_scene(folder, protocol)
     members = [load_run(place) for place in places]
     for place, member in zip(places, members, strict=True):
         if member.fingerprint != scene.fingerprint:
             raise InputError(f"{place}: trained on other pictures than those of {folder} under {protocol}")
+    told = [json.loads((place / "metrics.json").read_text()) for place in places]
+    results.mkdir(parents=True, exist_ok=True)
+    for count in counts:
+        record = joined_record(scene, run, seeds[:count], members[:count], told[:count])
+        write_json(place_of(folder.name, run, seeds[:count], protocol, results), record)
+        alone = " ".join(f"{one['mean']['psnr']:.2f}" for one in told[:count])
+        print(
+            f"{folder.name} {run}: seeds {','.join(map(str, seeds[:count]))} alone {alone} dB, "
+            f"joined {record['mean']['psnr']:.2f} dB",
+            flush=True,
+        )
+
+
+def place_of(scene: str, run: str, seeds: Sequence[int], protocol: str, results: Path) -> Path:
+    """The file of some seeds joined."""
+    return results / f"{scene}-{protocol}-{run.replace(':', '+')}-seeds{','.join(map(str, seeds))}.json"
+
+
+def joined_record(
+    scene: Scene, run: str, seeds: Sequence[int], members: Sequence[LoadedRun], told: Sequence[dict[str, Any]]
+) -> dict[str, Any]:
+    """The score of loaded runs joined, beside what each of them was ``told`` to have alone."""
     both = ensemble_of(members)
     began = time.perf_counter()
     scored = score_views(both.field, scene.test, both.occupancy, both.march, both.background)
-    told = [json.loads((place / "metrics.json").read_text()) for place in places]
-    record = metrics_record(
+    return metrics_record(
         {view.name: view.metrics for view in scored},
         scene=scene.name,
         protocol=scene.protocol,
@@ -62,11 +87,11 @@ def score(folder: Path, run: str, seeds: Sequence[int], protocol: str, runs: Pat
         seed=seeds[0],
         steps=both.step,
         seconds={"test": time.perf_counter() - began, "train": sum(one["seconds"]["train"] for one in told)},
-        config={**to_data(both.config), "scene": folder.name},
+        config={**to_data(both.config), "scene": scene.name},
         command=[
             "benchmarks/ensembles.py",
             "--scenes",
-            folder.name,
+            scene.name,
             "--runs",
             run,
             "--seeds",
@@ -79,14 +104,6 @@ def score(folder: Path, run: str, seeds: Sequence[int], protocol: str, runs: Pat
             for seed, one in zip(seeds, told, strict=True)
         ],
     )
-    results.mkdir(parents=True, exist_ok=True)
-    write_json(target, record)
-    alone = " ".join(f"{one['mean']['psnr']:.2f}" for one in told)
-    print(
-        f"{folder.name} {run}: seeds {joined} alone {alone} dB, joined {record['mean']['psnr']:.2f} dB",
-        flush=True,
-    )
-    return target
 
 
 def main(words: Sequence[str] | None = None) -> int:
@@ -111,11 +128,8 @@ def main(words: Sequence[str] | None = None) -> int:
         torch.set_num_threads(arguments.threads)
     for scene in arguments.scenes:
         for run in arguments.runs:
-            for count in range(2, len(arguments.seeds) + 1):
-                seeds = arguments.seeds[:count]
-                score(
-                    arguments.data / scene, run, seeds, arguments.protocol, arguments.kept, arguments.results
-                )
+            folder = arguments.data / scene
+            score(folder, run, arguments.seeds, arguments.protocol, arguments.kept, arguments.results)
     return 0
 
 

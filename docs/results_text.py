@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 HEAD = """# Results
 
-Every figure on this page is computed from the files in `benchmarks/results/quality/`, one for each run, which
-`benchmarks/quality.py` wrote; `python docs/make_results.py` writes the page from them. Ours are means over the test
+Every figure on this page is computed from files in `benchmarks/results/`, one for each run: `quality/` is written by
+`benchmarks/quality.py`, `ensembles/` by `benchmarks/ensembles.py`, a study's by `benchmarks/collect.py`.
+`python docs/make_results.py` writes the page from them. Ours are means over the test
 views of the protocol and, where there are several, over seeds; ± and [ ] are 95 % intervals (Student's t) over seeds,
 or over pairs of the same scene and seed. "α" marks rows that use the pictures' alpha to carve the box. A dash is a run
 that has not been made. Runs with one thread ran beside another one on the same two cores.
@@ -109,7 +110,7 @@ STUDIES = (
     (
         "best_opaque",
         "Pieces of `best` without alpha",
-        "Opaque pictures give no hull and no random backgrounds. Occlusion loss and L1 do not help there either.",
+        "Opaque pictures give no hull and no random backgrounds. Occlusion loss and L1 cost there; one seed.",
     ),
     (
         "best_full",

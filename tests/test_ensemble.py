@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -187,7 +186,7 @@ def test_an_ensemble_cannot_be_resumed(desk, tmp_path):
     config = load_run(desk / "a").config
     scene = load_scene(Path(config.scene or ""), "builtin8")
     with pytest.raises(InputError, match="an ensemble, which cannot be trained; resume its members"):
-        execute(replace(config), scene, tmp_path, resume=True)
+        execute(config, scene, tmp_path, resume=True)
 
 
 def test_the_command_and_those_that_read_what_it_wrote(desk, tmp_path, monkeypatch, capsys):
