@@ -170,6 +170,8 @@ scenes, so they are not part of the project.
   the tracks and before the grille, a white cloud hangs under the front; in low views (r_72, r_80, r_120) a fringe
   of haze hangs below the ground plate, which no training view sees from the side. From behind and above (r_0, r_8,
   r_192) white specks lie on the ground.
+* lego, masks as printed (the same view, 26.1 dB): as `few_tensorf`, the bucket's inside as blotched, a light smear in
+  the grille. Settings of FourieRF (24.8 dB): pale all over, grainy, a veil above the bucket and before the tracks.
 * lego, `best` (the same view, 29.4 dB): no fog and no haze. What is left: edges one pixel wide, the gaps of the
   tracks and of the grille, the inner wall of the bucket, a little soft. The worst views are the low ones from the
   side (24.6 dB) and the one from behind and above (24.1 dB).
