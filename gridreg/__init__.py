@@ -38,7 +38,14 @@ from gridreg.ray_penalties import (
     ray_entropy,
 )
 from gridreg.samples import RaySamples
-from gridreg.sampling import RandomBackground, SpaceAnnealing, anneal_space, random_background
+from gridreg.sampling import (
+    ExpectedBackground,
+    RandomBackground,
+    SpaceAnnealing,
+    anneal_space,
+    opacity_error,
+    random_background,
+)
 from gridreg.schedules import (
     Cosine,
     Geometric,
@@ -62,6 +69,7 @@ __all__ = [
     "DepthSmoothness",
     "DistanceGradientScaling",
     "Distortion",
+    "ExpectedBackground",
     "FixedMask",
     "FourierLowPass",
     "FrequencyMask",
@@ -118,6 +126,7 @@ __all__ = [
     "occlusion_loss",
     "octaves_of_channels",
     "opacity_entropy",
+    "opacity_error",
     "open_channels",
     "optical_depth_to_weights",
     "orthogonality",

@@ -20,7 +20,7 @@ __all__ = ["RaySamples"]
 _PER_SAMPLE = ("t", "delta", "index", "density", "weights")
 _PER_SAMPLE_3 = ("positions", "colours")
 _PER_RAY_3 = ("directions", "background")
-_PER_RAY = ("ray_start", "ray_steps")
+_PER_RAY = ("ray_start", "ray_steps", "target_opacity")
 _INTEGERS = ("offsets", "index", "ray_steps")
 
 
@@ -50,6 +50,8 @@ class RaySamples:
             the last kept sample.
         patch: ``(count, height, width)``: the last ``count * height * width`` rays are image patches, row by
             row; None: the rays have no order.
+        target_opacity: ``(R,)`` alpha, in [0, 1], of the pixel that each ray is compared with, NaN where it is not
+            known; None: it is known of no ray.
 
     Raises:
         InputError: a tensor has another shape, dtype or device than said above.
@@ -75,6 +77,7 @@ class RaySamples:
     ray_start: Tensor | None = None
     ray_steps: Tensor | None = None
     patch: tuple[int, int, int] | None = None
+    target_opacity: Tensor | None = None
 
     def __post_init__(self) -> None:
         if self.offsets.ndim != 1 or self.offsets.shape[0] < 1:
@@ -135,6 +138,7 @@ class RaySamples:
         background: Tensor | None = None,
         valid: Tensor | None = None,
         patch: tuple[int, int, int] | None = None,
+        target_opacity: Tensor | None = None,
     ) -> RaySamples:
         """Pack a rectangle of `R` rays with `S` samples each.
 
@@ -148,7 +152,7 @@ class RaySamples:
             directions: ``(R, 3)``, or None.
             background: ``(R, 3)``, or None.
             valid: ``(R, S)`` bool; the others are skipped, and count as density 0. None: all are kept.
-            patch: as in `RaySamples`.
+            patch, target_opacity: as in `RaySamples`.
 
         Raises:
             InputError: a shape differs, or `valid` is not bool.
@@ -201,6 +205,7 @@ class RaySamples:
             ray_start=t[:, 0] if width else t.new_zeros(rays),
             ray_steps=torch.full((rays,), width, dtype=torch.int64, device=density.device),
             patch=patch,
+            target_opacity=target_opacity,
         )
 
     def __len__(self) -> int:

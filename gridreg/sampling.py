@@ -8,17 +8,23 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from gridreg.base import Context, Regularizer, register
+from gridreg.base import Context, Regularizer, check_weight, register
 from gridreg.errors import InputError
+from gridreg.samples import RaySamples
 from gridreg.schedules import Numeric, check_numeric
 from gridreg.sites import SiteLike
 
 __all__ = [
+    "ExpectedBackground",
     "RandomBackground",
     "SpaceAnnealing",
     "anneal_space",
+    "opacity_error",
     "random_background",
 ]
+
+# Mean and variance of a colour drawn uniformly from [0, 1].
+_MEAN, _VARIANCE = 1 / 2, 1 / 12
 
 
 def random_background(count: int, generator: torch.Generator, per: Literal["ray", "batch"] = "ray") -> Tensor:
@@ -46,6 +52,31 @@ def random_background(count: int, generator: torch.Generator, per: Literal["ray"
         raise InputError(f"per={per!r}: expected 'ray' or 'batch'")
     drawn = torch.rand(count if per == "ray" else 1, 3, generator=generator, device=generator.device)
     return drawn.expand(count, 3)
+
+
+def opacity_error(samples: RaySamples) -> Tensor:
+    """Mean over rays of ``(o - a)^2``: opacity of the ray, alpha of its pixel; an unknown alpha (NaN) counts as met.
+
+    Args:
+        samples: with `target_opacity`.
+
+    Returns:
+        Scalar, unitless.
+
+    Raises:
+        InputError: the samples have no target opacity.
+
+    Example:
+        >>> density = torch.tensor([[1e3], [0.0], [0.0]])
+        >>> samples = RaySamples.from_dense(torch.ones(1), torch.ones(1), density)
+        >>> round(opacity_error(samples.replace(target_opacity=torch.tensor([1.0, 1.0, float("nan")]))).item(), 4)
+        0.3333
+    """
+    target = samples.target_opacity
+    if target is None:
+        raise InputError("opacity_error needs samples with target_opacity, found none")
+    error = samples.opacity - torch.where(target.isnan(), samples.opacity.detach(), target)
+    return error.square().sum() / max(1, samples.rays)
 
 
 def anneal_space(
@@ -128,6 +159,69 @@ class RandomBackground(Regularizer):
     def examples(cls, site: SiteLike) -> list[Regularizer]:
         """For each ray, and for the whole batch until half-way."""
         return [cls(), cls(per="batch", until=0.5)]
+
+
+@register
+@dataclass(frozen=True)
+class ExpectedBackground(Regularizer):
+    """What random backgrounds cost on average, without the noise of drawing them: see `RandomBackground`.
+
+    Let a pixel be off by ``e`` in its colour before black and by ``d`` in its opacity. Before a background ``b`` it
+    is off by ``e - d b``, and over all ``b`` in [0, 1]^3 the mean of its square, per channel, is
+    ``(e - d / 2)^2 + d^2 / 12``. So render and target get the same grey behind them, for a loss of squared errors, and
+    the second term is the penalty.
+
+    It needs what `RandomBackground` needs, and samples with `RaySamples.target_opacity`.
+
+    Args:
+        weight: factor of the penalty; 1: the expectation.
+        until: fraction of the run (float) or step (int) from which the scene's own background is back.
+
+    Formula: ``background = 1/2``, ``mean((o - a)^2) / 12`` over rays, ``o`` the opacity, ``a`` the pixel's alpha
+    Unit: squared colour
+    Source: the expectation of Instant-NGP's random backgrounds (Mueller et al. 2022); gridreg
+
+    Raises:
+        InputError: the weight is out of range.
+
+    Example:
+        >>> ExpectedBackground().needs()
+        ('target_opacity',)
+    """
+
+    weight: Numeric = 1.0
+    until: Numeric = 1.0
+
+    def __post_init__(self) -> None:
+        """Refuse at once what can be refused before the first step."""
+        check_weight(self.weight)
+        check_numeric("until", self.until, low=0.0)
+
+    def needs(self) -> tuple[str, ...]:
+        """The alpha of the pixels."""
+        return ("target_opacity",)
+
+    def penalty(self, samples: RaySamples, context: Context) -> Tensor:
+        """`opacity_error` by the variance of a uniform colour; 0 from the end on."""
+        return (_VARIANCE if context.step < context.end(self.until) else 0.0) * opacity_error(samples)
+
+    def background(
+        self, count: int, generator: torch.Generator, default: Tensor | None, context: Context
+    ) -> Tensor | None:
+        """Grey until the end, on the device and with the type of the default; the generator is not touched."""
+        if context.step >= context.end(self.until):
+            return default
+        grey = torch.full((count, 3), _MEAN, device=generator.device)
+        return grey if default is None else grey.to(default)
+
+    def value(self, context: Context) -> float:
+        """The weight while backgrounds are grey."""
+        return super().value(context) if context.step < context.end(self.until) else 0.0
+
+    @classmethod
+    def examples(cls, site: SiteLike) -> list[Regularizer]:
+        """In expectation, and stronger until half-way."""
+        return [cls(), cls(weight=3.0, until=0.5)]
 
 
 @register

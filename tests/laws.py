@@ -204,6 +204,7 @@ def gradients(regularizer: Regularizer, name: str) -> None:
                 colours=samples.colours.detach().view(8, 6, 3).double(),  # type: ignore[union-attr]
                 positions=samples.positions.detach().view(8, 6, 3).double(),  # type: ignore[union-attr]
                 patch=(2, 2, 2),
+                target_opacity=torch.linspace(0, 1, 8, dtype=torch.float64),
             )
             return regularizer.penalty(made_from, Context(clock)).double()
 

@@ -47,6 +47,7 @@ def samples_of(field: nn.Module) -> gridreg.RaySamples:
         directions=d[:8],
         background=torch.ones(8, 3),
         patch=(2, 2, 2),
+        target_opacity=torch.linspace(0, 1, 8),
     )
 
 

@@ -69,3 +69,20 @@ def test_a_room_is_no_backdrop(opaque):
     room = replace(scene, train=replace(scene.train, rgba=rgba))
     assert room.train.backdrop is None
     assert behind(build_trainer(CONFIG, room)).std() > 0.1
+
+
+def test_pixels_tell_their_opacity_but_not_on_a_backdrop(transparent, opaque):
+    config = replace(CONFIG, composition=[{"name": "ExpectedBackground"}])
+    scene = load_scene(transparent, "builtin8", test=[])
+    trainer = build_trainer(config, scene)
+    rendered, _ = trainer.render_batch()
+    assert torch.equal(rendered.samples.background, torch.full((64, 3), 0.5))
+    alpha = rendered.samples.target_opacity
+    assert set(alpha.unique().tolist()) <= set(scene.train.rgba[..., 3].unique().tolist())
+    report = trainer.train_step()
+    assert report["ExpectedBackground"] > 0
+    paper = build_trainer(config, load_scene(opaque, "holdout8"))
+    assert paper.render_batch()[0].samples.target_opacity.isnan().all()
+    report = paper.train_step()
+    assert report["ExpectedBackground"] == 0
+    assert report["loss"] == pytest.approx(report["mse"])

@@ -15,7 +15,14 @@ from gridreg.base import Clock, Context
 from gridreg.errors import InputError
 from gridreg.gradient_scaling import DistanceGradientScaling, scale_gradients_by_distance
 from gridreg.samples import RaySamples
-from gridreg.sampling import RandomBackground, SpaceAnnealing, anneal_space, random_background
+from gridreg.sampling import (
+    ExpectedBackground,
+    RandomBackground,
+    SpaceAnnealing,
+    anneal_space,
+    opacity_error,
+    random_background,
+)
 from tests.oracles import make_batch
 
 
@@ -63,6 +70,73 @@ class TestRandomBackground:
         for make in (RandomBackground, lambda per: random_background(1, seeded(), per)):
             with pytest.raises(InputError, match="per='pixel': expected 'ray' or 'batch'"):
                 make(per="pixel")  # type: ignore[arg-type]
+
+
+class TestExpectedBackground:
+    def pixels(self) -> tuple[RaySamples, Tensor, Tensor, Tensor]:
+        """Samples of 5 rays, and the densities behind them; their colour before black, and that of their pixels."""
+        generator = seeded(4)
+        density = 2 * torch.rand(5, 3, generator=generator, dtype=torch.float64)
+        density.requires_grad_()
+        alpha = torch.rand(5, generator=generator, dtype=torch.float64)
+        t = torch.arange(3, dtype=torch.float64)
+        samples = RaySamples.from_dense(t, torch.ones_like(t), density).replace(target_opacity=alpha)
+        colours = torch.rand(15, 3, generator=generator, dtype=torch.float64)
+        seen = samples.sum_per_ray(samples.weights[:, None] * colours)
+        wanted = torch.rand(5, 3, generator=generator, dtype=torch.float64) * alpha[:, None]
+        return samples, density, seen, wanted
+
+    def test_it_is_the_mean_over_all_backgrounds(self) -> None:
+        samples, density, seen, wanted = self.pixels()
+        alpha = samples.target_opacity
+        assert alpha is not None
+
+        def error(background: Tensor) -> Tensor:
+            render = seen + (1 - samples.opacity[:, None]) * background
+            return (render - wanted - (1 - alpha[:, None]) * background).square().mean()
+
+        regularizer, context = ExpectedBackground(), at_step(3)
+        grey = regularizer.background(5, seeded(), torch.ones(3, dtype=torch.float64), context)
+        assert grey is not None
+        assert grey.dtype == torch.float64
+        found = error(grey) + regularizer.penalty(samples, context)
+        # Of a polynomial of degree 2 in each channel, two nodes of Gauss and Legendre give the integral exactly.
+        nodes = 0.5 + torch.tensor([-1, 1], dtype=torch.float64) / 12**0.5
+        integral = torch.stack([error(node.expand(3)) for node in nodes]).mean()
+        torch.testing.assert_close(found, integral)
+        slopes = [torch.autograd.grad(value, density, retain_graph=True)[0] for value in (found, integral)]
+        torch.testing.assert_close(*slopes)
+        drawn = torch.stack([error(random_background(5, seeded(k)).double()) for k in range(4000)]).detach()
+        assert abs(float(drawn.mean() - found.detach())) < 4 * float(drawn.std()) / 4000**0.5
+        assert float(drawn.std()) > 0.01 * float(found.detach())
+
+    def test_unknown_pixels_count_as_met_and_none_is_refused(self) -> None:
+        samples, *_ = self.pixels()
+        alpha = samples.target_opacity
+        assert alpha is not None
+        some = alpha.clone()
+        some[1:] = float("nan")
+        expected = (samples.opacity[0] - alpha[0]).square() / 5
+        torch.testing.assert_close(opacity_error(samples.replace(target_opacity=some)), expected)
+        with pytest.raises(InputError, match="target_opacity, found none"):
+            opacity_error(samples.replace(target_opacity=None))
+        assert ExpectedBackground().needs() == ("target_opacity",)
+
+    def test_until_the_end_then_the_default(self) -> None:
+        regularizer, default = ExpectedBackground(weight=2.0, until=0.5), torch.ones(3)
+        samples, *_ = self.pixels()
+        assert regularizer.background(4, seeded(), default, at_step(50)) is default
+        assert regularizer.penalty(samples, at_step(50)).item() == 0
+        assert regularizer.penalty(samples, at_step(49)).item() > 0
+        assert [regularizer.value(at_step(step)) for step in (49, 50)] == [2, 0]
+        generator = seeded(1)
+        before = generator.get_state()
+        assert regularizer.background(4, generator, None, at_step(0)).tolist() == [[0.5] * 3] * 4  # type: ignore[union-attr]
+        assert torch.equal(generator.get_state(), before)
+
+    def test_a_weight_below_0_is_refused(self) -> None:
+        with pytest.raises(InputError, match="weight"):
+            ExpectedBackground(weight=-1.0)
 
 
 class TestSpaceAnnealing:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -117,14 +118,17 @@ class Trainer:
                 self.average.give(self.field.parameters())
 
     def render_batch(self) -> tuple[Rendered, Tensor]:
-        """Draw rays, render them, and composite their targets on the same background ``(R, 3)``."""
+        """Draw rays, render them, and composite their targets on the same background ``(R, 3)``.
+
+        The samples know the opacity of their targets, but for opaque pictures on a backdrop, which tell nothing of it.
+        """
         rays, rgba = self.bank.draw(self.settings.rays, self.generator)
         jitter = torch.rand(len(rays), generator=self.generator)
         default = self.scene.background.to(rgba)
-        background = None
+        background, opacity = None, torch.full_like(jitter, math.nan)
         # Behind opaque pictures on one colour, random ones would be answered with walls of that colour.
         if self.scene.train.backdrop is None:
-            background = self.handle.background(len(rays), self.generator, default)
+            background, opacity = self.handle.background(len(rays), self.generator, default), rgba[:, 3]
         background = (default if background is None else background).expand(len(rays), 3)
         target = rgba[:, :3] * rgba[:, 3:] + (1 - rgba[:, 3:]) * background
         march = self.march
@@ -140,7 +144,8 @@ class Trainer:
             hook=self.handle,
             generator=self.generator,
         )
-        return rendered, target
+        assert rendered.samples is not None
+        return replace(rendered, samples=rendered.samples.replace(target_opacity=opacity)), target
 
     def train_step(self) -> StepReport:
         """One iteration.
