@@ -69,6 +69,15 @@ ROWS = {
         "best", "no direction", "direction without octaves", "features without octaves", "dropout of the direction",
         "no small pieces",
     ],
+    "best_lean": [
+        "best", "hidden layers of 64", "24 components of appearance",
+        "hidden layers of 64 and 24 components of appearance",
+    ],
+    "best_others": [
+        "best", "expected background", "opacity entropy 0.001", "ray entropy 0.001", "weight decay 0.01",
+        "later resampling", "rates are not reset", "spatial annealing", "twice as many rays in half as many iterations",
+    ],
+    "best_background": ["random", "expected"],
     "best_full": ["best", "distortion 0.01", "learning rate of grids 0.04", "total variation 0.006"],
     "best_opaque": [
         "best without alpha", "no occlusion loss", "no L1", "no distortion", "occlusion loss 0.01",
