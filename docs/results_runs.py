@@ -21,14 +21,18 @@ def records_in(folder: Path) -> list[dict[str, Any]]:
 
 
 class Runs:
-    """The stored runs, by scene, protocol, run and seed; shortened and changed runs are left out."""
+    """The stored runs, by scene, protocol, run and seed; changed ones and those of the plain path are left out.
+
+    A run of another length than its preset's is called ``RUN --steps N``.
+    """
 
     def __init__(self, folder: Path = STORE) -> None:
         self.records: dict[tuple[str, str, str], dict[int, dict[str, Any]]] = {}
         for record in records_in(folder):
-            if "--steps" in record["command"] or record["changes"]:
+            if record["changes"] or "--backend" in record["command"]:
                 continue
-            key = (record["scene"], record["protocol"], record["run"])
+            length = f" --steps {record['steps']}" if "--steps" in record["command"] else ""
+            key = (record["scene"], record["protocol"], record["run"] + length)
             self.records.setdefault(key, {})[record["seed"]] = record
 
     def of(self, scene: str, protocol: str, run: str) -> dict[int, dict[str, Any]]:

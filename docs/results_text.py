@@ -40,7 +40,7 @@ METHODS = (
     Method("Few TensoRF, masks as printed", "few_tensorf:few_tensorf_printed", {}),
     Method("FreeNeRF", "freenerf", {"lego": 24.81, "chair": 27.01}),
     Method("in the style of FourieRF", "fourierf", {}),
-    Method("in the style of SANeRF", "sanerf", {}),
+    Method("in the style of SANeRF, 2,500 iterations as in its program", "sanerf --steps 2500", {}),
     Method("`quick`", "quick", {}),
     Method("`best`", "best", {}),
     Method("`best-long`", "best-long", {}),

@@ -36,9 +36,14 @@ def test_figures_are_means_over_seeds_of_whole_runs(results: ModuleType, tmp_pat
     store(tmp_path, "tensorf", "lego", 0, 24.0)
     store(tmp_path, "tensorf", "lego", 1, 25.0)
     # Shortened and changed runs are others.
-    store(tmp_path, "tensorf", "lego", 2, 10.0, command=["quality.py", "--steps", "9"])
+    shortened = ["quality.py", "--steps", "9"]
+    store(tmp_path, "tensorf", "lego", 2, 10.0, command=shortened, steps=9)
+    store(tmp_path, "tensorf", "lego", 2, 11.0, command=[*shortened, "--backend", "torch"], steps=9)
     store(tmp_path, "tensorf", "lego", 3, 10.0, changes=["train.rays=9"])
-    page = results.few_shot(results.Runs(tmp_path), "dietnerf8")
+    runs = results.Runs(tmp_path)
+    found = runs.mean("lego", "dietnerf8", "tensorf --steps 9", results.psnr)
+    assert (found.mean, found.count) == (10.0, 1)
+    page = results.few_shot(runs, "dietnerf8")
     row = next(line for line in page.splitlines() if line.startswith("| TensoRF |"))
     assert "| 24.50 ± 6.35 (2) | 23.83 | 0.900 | 2.0; 2 | – |" in row
 

@@ -71,7 +71,7 @@ ROWS = {
     ],
     "best_lean": [
         "best", "hidden layers of 64", "24 components of appearance",
-        "hidden layers of 64 and 24 components of appearance",
+        "hidden layers of 64 and 24 components of appearance", "pools of 0.05", "pools of 0.1",
     ],
     "best_others": [
         "best", "expected background", "opacity entropy 0.001", "ray entropy 0.001", "weight decay 0.01",
