@@ -109,75 +109,99 @@ def _flat(table: Any) -> None:
 
 
 @inline
-def _grid_step(
-    p: Any,
-    g: Any,
-    m: Any,
-    v: Any,
-    kept: Any,
-    high: Any,
-    i: int,
-    to: int,
-    ahead: int,
-    n: Any,
-    like: Any,
-    s: Any,
-    k: Any,
-) -> tuple[Any, Any, Any, Any, Any]:
-    """One step of `_grid`; returns what it adds to the sums of the five terms.
-
-    A missing neighbour is the element itself, as its offset is 0: its difference is 0.
-    """
-    c, low, slope = load(p, i, like), load(kept, to, like), load(g, i, like)
-    store(g, i, like)
-    # From here on `kept` holds the present slab, up to and with this step.
-    store(kept, to, c)
-    by_slab = load(high, ahead, like) - c
-    by_node = load(p, i + n.right, like) - c
-    gradient = slope + k.slabs * (c - low - by_slab) + k.nodes * (c - load(kept, to - n.left, like) - by_node)
-    by_row = load(p, i + n.down, like) - c
-    gradient = gradient + k.rows * (c - load(kept, to - n.up, like) - by_row)
-    gradient = gradient + k.sign * sign(c) + k.value * c
-    _moments(p, m, v, i, c, gradient, s)
-    return by_slab * by_slab, by_row * by_row, by_node * by_node, magnitude(c), c * c
+def _flat_piece(p: Any, g: Any, m: Any, v: Any, begin: int, end: int, s: Any, k: Any, sums: Any) -> None:
+    """`_flat_step` for some elements, added to the sums of ``|p|`` and ``p^2``."""
+    for first in range(begin, end, _PIECE):
+        last = min(first + _PIECE, end)
+        split = last - (last - first) % LANES
+        sizes, squares = wide(), wide()
+        for i in range(first, split, LANES):
+            size, square = _flat_step(p, g, m, v, i, wide(), s, k)
+            sizes, squares = sizes + size, squares + square
+        size_sum, square_sum = total(sizes), total(squares)
+        for i in range(split, last):
+            size, square = _flat_step(p, g, m, v, i, one(), s, k)
+            size_sum, square_sum = size_sum + size, square_sum + square
+        sums[3] += size_sum
+        sums[4] += square_sum
 
 
 @inline
-def _grid_piece(
-    p: Any,
-    g: Any,
-    m: Any,
-    v: Any,
-    kept: Any,
-    high: Any,
-    at: int,
-    to: int,
-    ahead: int,
-    count: int,
-    n: Any,
-    s: Any,
-    k: Any,
-    sums: Any,
-) -> None:
+def _plane_step(
+    p: Any, g: Any, low: Any, high: Any, i: int, below: int, above: int, n: Any, like: Any, k: Any
+) -> tuple[Any, Any, Any]:
+    """Add the differences to the neighbours by slab and by node to the gradient; returns the squares of those ahead.
+
+    A missing neighbour is the element itself, as its offset is 0: its difference is 0.
+    """
+    c = load(p, i, like)
+    by_slab, by_node = load(high, above, like) - c, load(p, i + n.right, like) - c
+    gradient = load(g, i, like) + k.slabs * (c - load(low, below, like) - by_slab)
+    store(g, i, gradient + k.nodes * (c - load(p, i - n.left, like) - by_node))
+    return by_slab * by_slab, like, by_node * by_node
+
+
+@inline
+def _solid_step(
+    p: Any, g: Any, low: Any, high: Any, i: int, below: int, above: int, n: Any, like: Any, k: Any
+) -> tuple[Any, Any, Any]:
+    """`_plane_step`, and the neighbours by row."""
+    c = load(p, i, like)
+    by_row = load(p, i + n.down, like) - c
+    store(g, i, load(g, i, like) + k.rows * (c - load(p, i - n.up, like) - by_row))
+    by_slab, _, by_node = _plane_step(p, g, low, high, i, below, above, n, like, k)
+    return by_slab, by_row * by_row, by_node
+
+
+@inline
+def _difference_piece(
+    p: Any, g: Any, low: Any, high: Any, at: int, below: int, above: int, count: int, n: Any, k: Any, sums: Any,
+    step: Any,
+) -> None:  # fmt: skip
     """``count`` elements from ``at`` on that all have the same neighbours."""
     for first in range(0, count, _PIECE):
         last = min(first + _PIECE, count)
         split = last - (last - first) % LANES
-        a0, a1, a2, a3, a4 = wide(), wide(), wide(), wide(), wide()
+        a0, a1, a2 = wide(), wide(), wide()
         for i in range(first, split, LANES):
-            b0, b1, b2, b3, b4 = _grid_step(
-                p, g, m, v, kept, high, at + i, to + i, ahead + i, n, wide(), s, k
-            )
-            a0, a1, a2, a3, a4 = a0 + b0, a1 + b1, a2 + b2, a3 + b3, a4 + b4
-        c0, c1, c2, c3, c4 = total(a0), total(a1), total(a2), total(a3), total(a4)
+            b0, b1, b2 = step(p, g, low, high, at + i, below + i, above + i, n, wide(), k)
+            a0, a1, a2 = a0 + b0, a1 + b1, a2 + b2
+        c0, c1, c2 = total(a0), total(a1), total(a2)
         for i in range(split, last):
-            d0, d1, d2, d3, d4 = _grid_step(p, g, m, v, kept, high, at + i, to + i, ahead + i, n, one(), s, k)
-            c0, c1, c2, c3, c4 = c0 + d0, c1 + d1, c2 + d2, c3 + d3, c4 + d4
+            d0, d1, d2 = step(p, g, low, high, at + i, below + i, above + i, n, one(), k)
+            c0, c1, c2 = c0 + d0, c1 + d1, c2 + d2
         sums[0] += c0
         sums[1] += c1
         sums[2] += c2
-        sums[3] += c3
-        sums[4] += c4
+
+
+@inline
+def _differences(
+    p: Any, g: Any, low: Any, below: int, high: Any, above: int, at: int, rows: int, nodes: int, inner: int, k: Any,
+    sums: Any,
+) -> None:  # fmt: skip
+    """Add the differences to all neighbours to the gradient of the slab at ``at``; the slabs before and behind it begin
+    at ``below`` of low and at ``above`` of high."""
+    length = nodes * inner
+    for r in range(rows):
+        to = r * length
+        up, down = length if r > 0 else 0, length if r + 1 < rows else 0
+        # The first node has no left neighbour, the last one no right one.
+        for part in range(3):
+            start = 0 if part == 0 else inner if part == 1 else length - inner
+            stop = inner if part == 0 else length - inner if part == 1 else length
+            if part == 2 and nodes == 1:
+                continue
+            left, right = 0 if part == 0 else inner, 0 if part == 2 or nodes == 1 else inner
+            n, i, count = Neighbours(left, right, up, down), to + start, stop - start
+            if rows > 1:
+                _difference_piece(
+                    p, g, low, high, at + i, below + i, above + i, count, n, k, sums, _solid_step
+                )
+            else:
+                _difference_piece(
+                    p, g, low, high, at + i, below + i, above + i, count, n, k, sums, _plane_step
+                )
 
 
 @kernel
@@ -185,8 +209,8 @@ def _grid(table: Any) -> None:
     """As `_flat`, then the old slabs before and after each block, slabs, rows, nodes, inner, slabs of a
     block.
 
-    A task is a block of slabs. Parameters are overwritten in place, so old values that neighbours still need
-    are kept, one slab of them; what lies in other blocks was copied beforehand.
+    A task is a block of slabs. A slab is updated as soon as the differences of the next one are known, as these still
+    need its old values; what lies in other blocks was copied beforehand.
     """
     p, g, m, v = (
         vector(table, 0, float32),
@@ -204,10 +228,8 @@ def _grid(table: Any) -> None:
         integer(table, 12),
     )
     s, k = _constants(numbers), _factors(numbers)
-    length = nodes * inner
-    slab = rows * length
+    slab = rows * nodes * inner
     blocks = (slabs + block - 1) // block
-    kept = np.empty(slab, np.float32)
     while True:
         task = next_task(table)
         if task < 0:
@@ -216,46 +238,22 @@ def _grid(table: Any) -> None:
         first, last = number * block, min((number + 1) * block, slabs)
         # Of inner boundaries only, so one slab less than there are blocks.
         edge = (outer * (blocks - 1) + number) * slab
-        at = (outer * slabs + first) * slab
-        # A loop, as the error that assigning a slice may raise takes seconds to compile.
-        for i in range(slab):
-            kept[i] = before[edge - slab + i] if number > 0 else p[at + i]
         for a in range(first, last):
             at = (outer * slabs + a) * slab
-            for r in range(rows):
-                to = r * length
-                i = at + to
-                high, ahead = p, i
-                if a + 1 < last:
-                    ahead = i + slab
-                elif a + 1 < slabs:
-                    high, ahead = after, edge + to
-                up, down = length if r > 0 else 0, length if r + 1 < rows else 0
-                # The first node has no left neighbour, the last one no right one.
-                for part in range(3):
-                    start = 0 if part == 0 else inner if part == 1 else length - inner
-                    stop = inner if part == 0 else length - inner if part == 1 else length
-                    if part == 2 and nodes == 1:
-                        continue
-                    n = Neighbours(
-                        0 if part == 0 else inner, 0 if part == 2 or nodes == 1 else inner, up, down
-                    )
-                    _grid_piece(
-                        p,
-                        g,
-                        m,
-                        v,
-                        kept,
-                        high,
-                        i + start,
-                        to + start,
-                        ahead + start,
-                        stop - start,
-                        n,
-                        s,
-                        k,
-                        sums[task],
-                    )
+            low, below, high, above = p, at, p, at
+            if a > first:
+                below = at - slab
+            elif number > 0:
+                low, below = before, edge - slab
+            if a + 1 < last:
+                above = at + slab
+            elif a + 1 < slabs:
+                high, above = after, edge
+            _differences(p, g, low, below, high, above, at, rows, nodes, inner, k, sums[task])
+            if a > first:
+                _flat_piece(p, g, m, v, at - slab, at, s, k, sums[task])
+        at = (outer * slabs + last - 1) * slab
+        _flat_piece(p, g, m, v, at, at + slab, s, k, sums[task])
 
 
 class Job(NamedTuple):

@@ -36,14 +36,17 @@ _ORDER = (
     "dots._low",
     "dots._sum_rows",
     "sums._fold",
-    "perceptron._backward",
+    "perceptron_dots.backward",
+    "perceptron_float.backward",
     "pools._gather",
     "composite._pixels_backward",
     "composite._pixels_forward",
     "pools._spread",
-    "perceptron._forward",
+    "perceptron_dots.forward",
+    "perceptron_float.forward",
 )
-_DOTS = ("dots", "perceptron")
+# Modules that only a processor with dot products of bfloat16 needs, and that only others need.
+_DOTS, _OTHERS = ("dots", "perceptron_dots"), ("perceptron_float",)
 
 
 def start() -> subprocess.Popen[bytes] | None:
@@ -79,7 +82,7 @@ def main() -> None:
     """Compile until there is a kernel that another process has compiled."""
     for name in _ORDER:
         module, _, function = name.partition(".")
-        if module in _DOTS and not available():
+        if module in (_OTHERS if available() else _DOTS):
             continue
         kernel = getattr(importlib.import_module(f"backbones.kernels.{module}"), function)
         if kernel.cached:

@@ -13,7 +13,7 @@ from llvmlite import binding, ir  # type: ignore[import-untyped]
 from numba import config, types
 from numba.core import cgutils
 
-from backbones.kernels.bfloat16 import load_low
+from backbones.kernels.bfloat16 import get
 from backbones.kernels.compiler import inline, int32, int64, intrinsic, uint16
 from backbones.kernels.simd import LANES, load, one, store, wide
 
@@ -335,10 +335,10 @@ def sum_products(of_slope: Any, high: Any, of_x: Any, width: Any, pairs: Any, ou
 
 @inline
 def add_rows(x: Any, width: Any, first: Any, count: Any, totals: Any, total: Any) -> Any:
-    """Add rows of x, ``width`` wide, to the totals from ``total`` on."""
+    """Add rows of x, ``width`` wide, bfloat16 or float32, to the totals from ``total`` on."""
     split = width - width % LANES
     for at in range(first * width, (first + count) * width, width):
         for n in range(0, split, LANES):
-            store(totals, total + n, load(totals, total + n, wide()) + load_low(x, at + n, wide()))
+            store(totals, total + n, load(totals, total + n, wide()) + get(x, at + n, wide()))
         for n in range(split, width):
-            totals[total + n] += load_low(x, at + n, one())
+            totals[total + n] += get(x, at + n, one())

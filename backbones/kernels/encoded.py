@@ -206,16 +206,16 @@ def encoded_mlp(
     check_layers(layers, sum(block.width for block in given))
     flat = [tensor for layer in layers for tensor in layer]
     tensors = [block.x for block in given] + [tensor for tensor in flat if tensor is not None]
+    dtype = product_dtype(precision)
     fused = (
         takes_compiled(*tensors)
-        and product_dtype(precision) is torch.bfloat16
         and count > 0
         and all(block.octaves <= MOST_OCTAVES for block in given)
         and not any(block.x.requires_grad for block in given if block.rows is not None)
     )
-    if fused and fits(given, layers):
-        return perceptron(given, count, flat)
-    if fused:
+    if fused and fits(given, layers, dtype):
+        return perceptron(given, count, flat, dtype)
+    if fused and dtype == torch.bfloat16:
         out: Tensor = _EncodedMLP.apply(given, count, *(block.x for block in given), *flat)  # type: ignore[no-untyped-call]
         return out
     return _apart(given, layers, precision)

@@ -1,10 +1,10 @@
-"""Positional encodings in bfloat16, for kernels: written from a sine and a cosine, and their gradient read back."""
+"""Positional encodings in bfloat16 or float32, for kernels: written from sine and cosine, gradients read back."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from backbones.kernels.bfloat16 import load_low
+from backbones.kernels.bfloat16 import get
 from backbones.kernels.compiler import float32, inline
 from backbones.kernels.simd import store
 
@@ -34,12 +34,12 @@ def read_octaves(
 ) -> None:
     """Write ``g_x + sum over octaves of f (cos g_sin - sin g_cos)``, from encodings at ``at`` and gradients at
     ``begin``."""
-    total = load_low(g, begin, like)
+    total = get(g, begin, like)
     frequency = float32(1)
     for octave in range(octaves):
         place = (1 + 2 * octave) * dims
-        sine, cosine = load_low(x, at + place, like), load_low(x, at + place + dims, like)
-        slope = cosine * load_low(g, begin + place, like) - sine * load_low(g, begin + place + dims, like)
+        sine, cosine = get(x, at + place, like), get(x, at + place + dims, like)
+        slope = cosine * get(g, begin + place, like) - sine * get(g, begin + place + dims, like)
         total = total + frequency * slope
         frequency = frequency * float32(2)
     store(result, to, total)

@@ -1,0 +1,86 @@
+"""Rows of positional encodings, side by side, written and read within the kernels of a perceptron.
+
+Encodings are bfloat16 or float32, as the array says that holds them.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from backbones.kernels.compiler import float32, inline, int64, integer, vector
+from backbones.kernels.octaves import read_octaves, write_octaves
+from backbones.kernels.simd import LANES, load, one, wide
+from backbones.kernels.waves import sine_and_cosine
+
+__all__ = ["OF_BLOCK", "decode_rows", "encode_rows"]
+
+OF_BLOCK = 4
+"""Arguments of a kernel for each block of encodings."""
+
+
+@inline
+def encode_rows(
+    table: Any, place: Any, blocks: Any, first: Any, count: Any, encoded: Any, width: Any, write: Any
+) -> Any:
+    """Write the encodings of some rows, and zeros behind them.
+
+    Args:
+        table: of the kernel; from ``place`` on x, rows, dims and octaves of each block.
+        first, count: rows.
+        encoded: ``width`` wide; the last vector that is written may reach beyond its block.
+        write: eight float32 to it.
+    """
+    at = int64(0)
+    for block in range(blocks):
+        where = place + OF_BLOCK * block
+        x, rows = vector(table, where, float32), vector(table, where + 1, int64)
+        dims, octaves = integer(table, where + 2), integer(table, where + 3)
+        by_row = rows.shape[0] > 0
+        for n in range(first, first + count):
+            source, to = (rows[n] if by_row else n) * dims, n * width + at
+            # From the last vector on, as what a vector is too wide belongs to places that are written later.
+            for i in range((dims - 1) // LANES * LANES, -1, -LANES):
+                value = load(x, source + i, wide())
+                sine, cosine = value, value
+                if octaves > 0:
+                    sine, cosine = sine_and_cosine(value)
+                write_octaves(value, sine, cosine, encoded, to + i, dims, octaves, write)
+        at += dims * (1 + 2 * octaves)
+    for n in range(first, first + count):
+        for i in range(n * width + at, (n + 1) * width):
+            encoded[i] = 0
+
+
+@inline
+def decode_rows(
+    table: Any,
+    place: Any,
+    blocks: Any,
+    first: Any,
+    count: Any,
+    encoded: Any,
+    width: Any,
+    g: Any,
+    wider: Any,
+) -> Any:
+    """Gradients of the inputs, from those of the encodings.
+
+    Args:
+        table: of the kernel; from ``place`` on result, first column, dims and octaves of each block.
+        first, count: rows.
+        encoded: ``width`` wide.
+        g: gradients of the encodings, from the first of these rows on, ``wider`` wide.
+    """
+    for block in range(blocks):
+        where = place + OF_BLOCK * block
+        result, begin = vector(table, where, float32), integer(table, where + 1)
+        dims, octaves = integer(table, where + 2), integer(table, where + 3)
+        if result.shape[0] == 0:
+            continue
+        split = dims - dims % LANES
+        for r in range(count):
+            at, source, to = (first + r) * width + begin, r * wider + begin, (first + r) * dims
+            for i in range(0, split, LANES):
+                read_octaves(encoded, at + i, g, source + i, result, to + i, dims, octaves, wide())
+            for i in range(split, dims):
+                read_octaves(encoded, at + i, g, source + i, result, to + i, dims, octaves, one())
