@@ -48,7 +48,7 @@ ROWS = {
     ],
     "best_leave_one_out": [
         "best", "no distortion", "no occlusion loss", "no L1", "no L1 and no occlusion loss", "no total variation",
-        "no random background",
+        "white background",
         "no carving", "no mean of the last fifth", "slower learning as in TensoRF",
     ],
     "finetuned_search": [
@@ -74,10 +74,10 @@ ROWS = {
         "hidden layers of 64 and 24 components of appearance", "pools of 0.05", "pools of 0.1",
     ],
     "best_others": [
-        "best", "expected background", "opacity entropy 0.001", "ray entropy 0.001", "weight decay 0.01",
+        "best", "opacity entropy 0.001", "ray entropy 0.001", "weight decay 0.01",
         "later resampling", "rates are not reset", "spatial annealing", "twice as many rays in half as many iterations",
     ],
-    "best_background": ["random", "expected"],
+    "best_background": ["drawn backgrounds", "backgrounds in expectation"],
     "best_full": ["best", "distortion 0.01", "learning rate of grids 0.04", "total variation 0.006"],
     "best_opaque": [
         "best without alpha", "no occlusion loss", "no L1", "no distortion", "occlusion loss 0.01",
