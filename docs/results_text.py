@@ -99,7 +99,15 @@ STUDIES = (
         "Pieces of `best`",
         "One piece left out at a time; what a negative figure says is lost without it. Occlusion loss, L1 and "
         "distortion give about a tenth of a decibel each, lego more than chair, and seeds differ by more than that; "
-        "the mean of the last fifth gives little, in every pair, and costs nothing.",
+        "the mean of the last fifth gives little, in every pair, and costs nothing. Measured when backgrounds were "
+        "drawn; \"no random background\" is a white one.",
+    ),
+    (
+        "best_background",
+        "What stands behind the pictures while `best` trains",
+        "Random colours that are drawn, or what these cost on average without their noise (`ExpectedBackground`), which "
+        "`best` has had since. The drawn ones are the runs of `best_full.yaml`, made on another machine, which changes "
+        "less: compare the first rows of `best_lean` and `best_cells`.",
     ),
     (
         "best_views",
@@ -117,6 +125,12 @@ STUDIES = (
         "Changes to `best` at its full length",
         "Distortion three times as strong helps chair and costs lego; slower learning and stronger total variation "
         "change little.",
+    ),
+    (
+        "best_lean",
+        "A leaner `best`",
+        "With drawn backgrounds, as it was. Half the components of appearance, or a narrower colour network, are as good "
+        "after these few iterations; both together lose on both scenes.",
     ),
     (
         "best_cells",

@@ -71,6 +71,24 @@ def _factors(x: Any) -> Terms:
     return Terms(x[7], x[8], x[9], x[10], x[11])
 
 
+@inline
+def _flat_piece(p: Any, g: Any, m: Any, v: Any, begin: int, end: int, s: Any, k: Any, sums: Any) -> None:
+    """`_flat_step` for some elements, added to the sums of ``|p|`` and ``p^2``."""
+    for first in range(begin, end, _PIECE):
+        last = min(first + _PIECE, end)
+        split = last - (last - first) % LANES
+        sizes, squares = wide(), wide()
+        for i in range(first, split, LANES):
+            size, square = _flat_step(p, g, m, v, i, wide(), s, k)
+            sizes, squares = sizes + size, squares + square
+        size_sum, square_sum = total(sizes), total(squares)
+        for i in range(split, last):
+            size, square = _flat_step(p, g, m, v, i, one(), s, k)
+            size_sum, square_sum = size_sum + size, square_sum + square
+        sums[3] += size_sum
+        sums[4] += square_sum
+
+
 @kernel
 def _flat(table: Any) -> None:
     """Constants ``(jobs, 12)``, job and first element of each task ``(tasks, 2)``, sums ``(tasks, 5)``; then of each
@@ -93,37 +111,8 @@ def _flat(table: Any) -> None:
         end = min(begin + _FLAT, p.shape[0])
         for first in range(begin, end, _PIECE):
             last = min(first + _PIECE, end)
-            if skips and m[first] == _ZERO and _idle(g, m, v, first, last):
-                continue
-            split = last - (last - first) % LANES
-            sizes, squares = wide(), wide()
-            for i in range(first, split, LANES):
-                size, square = _flat_step(p, g, m, v, i, wide(), s, k)
-                sizes, squares = sizes + size, squares + square
-            size_sum, square_sum = total(sizes), total(squares)
-            for i in range(split, last):
-                size, square = _flat_step(p, g, m, v, i, one(), s, k)
-                size_sum, square_sum = size_sum + size, square_sum + square
-            sums[task, 3] += size_sum
-            sums[task, 4] += square_sum
-
-
-@inline
-def _flat_piece(p: Any, g: Any, m: Any, v: Any, begin: int, end: int, s: Any, k: Any, sums: Any) -> None:
-    """`_flat_step` for some elements, added to the sums of ``|p|`` and ``p^2``."""
-    for first in range(begin, end, _PIECE):
-        last = min(first + _PIECE, end)
-        split = last - (last - first) % LANES
-        sizes, squares = wide(), wide()
-        for i in range(first, split, LANES):
-            size, square = _flat_step(p, g, m, v, i, wide(), s, k)
-            sizes, squares = sizes + size, squares + square
-        size_sum, square_sum = total(sizes), total(squares)
-        for i in range(split, last):
-            size, square = _flat_step(p, g, m, v, i, one(), s, k)
-            size_sum, square_sum = size_sum + size, square_sum + square
-        sums[3] += size_sum
-        sums[4] += square_sum
+            if not (skips and m[first] == _ZERO and _idle(g, m, v, first, last)):
+                _flat_piece(p, g, m, v, first, last, s, k, sums[task])
 
 
 @inline

@@ -15,6 +15,7 @@ from numba.core import cgutils
 
 from backbones.kernels.bfloat16 import get
 from backbones.kernels.compiler import inline, int32, int64, intrinsic, uint16
+from backbones.kernels.register_blocks import INDEX, LONG, REALS, ahead, everywhere, places_of, relu, summed
 from backbones.kernels.simd import LANES, load, one, store, wide
 
 __all__ = [
@@ -53,7 +54,7 @@ SUMMED = 64
 TASKS = 16
 # Pairs of the rows of a sum.
 PAIRS = SUMMED // 2 * WIDEST
-_WORD, _INDEX = ir.IntType(32), ir.IntType(64)
+_WORD = ir.IntType(32)
 
 
 class _BFloat(ir.types.Type):  # type: ignore[misc]
@@ -69,7 +70,6 @@ class _BFloat(ir.types.Type):  # type: ignore[misc]
         return hash(_BFloat)
 
 
-_REALS = ir.VectorType(ir.FloatType(), 16)
 _WORDS = ir.VectorType(_WORD, 16)
 _SHORTS = ir.VectorType(ir.IntType(16), 16)
 _LOW, _HALF = ir.VectorType(_BFloat(), 32), ir.VectorType(_BFloat(), 16)
@@ -86,11 +86,6 @@ def available() -> bool:
         return bool(binding.get_host_cpu_features().get("avx512bf16", False))
     except RuntimeError:
         return False
-
-
-def _vector(builder: Any, pointer: Any, index: Any, like: Any) -> Any:
-    """Pointer to a vector of type ``like`` that begins at an element."""
-    return builder.bitcast(builder.gep(pointer, [index]), like.as_pointer())
 
 
 def _lowered(builder: Any, value: Any) -> Any:
@@ -124,70 +119,46 @@ def _block(vectors: int, ending: str) -> Any:
             )
             left, right = (builder.bitcast(x, _WORD.as_pointer()) for x in (left, right))
             _, at, down, along, _, begin, pairs, _, to, row, _, n = arguments
-            kind = ir.FunctionType(_REALS, [_REALS, _LOW, _LOW])
+            kind = ir.FunctionType(REALS, [REALS, _LOW, _LOW])
             dot = cgutils.get_or_insert_function(builder.module, kind, _DOT)  # type: ignore[no-untyped-call]
-            places = [
-                builder.add(builder.add(to, builder.mul(row, _INDEX(r))), _INDEX(16 * v))
-                for r in range(HIGH)
-                for v in range(vectors)
-            ]
-            nothing = ir.Constant(_REALS, [0.0] * 16)
+            places = places_of(builder, to, row, HIGH, vectors)
+            nothing = ir.Constant(REALS, [0.0] * LONG)
             before = [nothing] * len(places)
             if ending == "add":
-                before = [builder.load(_vector(builder, out, place, _REALS), align=4) for place in places]
-            entry = builder.block
-            head, body, end = (builder.append_basic_block(name) for name in ("pairs", "pair", "done"))
-            builder.branch(head)
-            builder.position_at_end(head)
-            number = builder.phi(_INDEX)
-            number.add_incoming(_INDEX(0), entry)
-            sums = []
-            for value in before:
-                sums.append(builder.phi(_REALS))
-                sums[-1].add_incoming(value, entry)
-            builder.cbranch(builder.icmp_signed("<", number, pairs), body, end)
-            builder.position_at_end(body)
-            first = builder.add(begin, builder.mul(number, _INDEX(16)))
-            panel = builder.mul(pairs, _INDEX(16))
-            factors = []
-            for v in range(vectors):
-                place = builder.add(first, builder.mul(panel, _INDEX(v)))
-                words = builder.load(_vector(builder, right, place, _WORDS), align=4)
-                factors.append(builder.bitcast(words, _LOW))
-            start = builder.add(at, builder.mul(number, along))
-            undefined, everywhere = ir.Constant(_WORDS, ir.Undefined), ir.Constant(_WORDS, [0] * 16)
-            grown: list[Any] = []
-            for r in range(HIGH):
-                pair = builder.load(builder.gep(left, [builder.add(start, builder.mul(down, _INDEX(r)))]))
-                pair = builder.insert_element(undefined, pair, _WORD(0))
-                pair = builder.bitcast(builder.shuffle_vector(pair, undefined, everywhere), _LOW)
-                for factor in factors:
-                    grown.append(builder.call(dot, [sums[len(grown)], pair, factor]))
-            number.add_incoming(builder.add(number, _INDEX(1)), body)
-            for value, larger in zip(sums, grown, strict=True):
-                value.add_incoming(larger, body)
-            builder.branch(head)
-            builder.position_at_end(end)
-            added = []
-            if ending in ("full", "low", "relu"):
-                added = [
-                    builder.load(_vector(builder, more, builder.add(n, _INDEX(16 * v)), _REALS), align=4)
-                    for v in range(vectors)
-                ]
+                before = [builder.load(ahead(builder, out, place), align=4) for place in places]
+            panel = builder.mul(pairs, INDEX(LONG))
+
+            def grow(number: Any, sums: Any) -> list[Any]:
+                first = builder.add(begin, builder.mul(number, INDEX(LONG)))
+                factors = []
+                for v in range(vectors):
+                    place = builder.add(first, builder.mul(panel, INDEX(v)))
+                    words = builder.load(ahead(builder, right, place, _WORDS), align=4)
+                    factors.append(builder.bitcast(words, _LOW))
+                start = builder.add(at, builder.mul(number, along))
+                grown: list[Any] = []
+                for r in range(HIGH):
+                    pair = builder.load(builder.gep(left, [builder.add(start, builder.mul(down, INDEX(r)))]))
+                    pair = builder.bitcast(everywhere(builder, pair), _LOW)
+                    for factor in factors:
+                        grown.append(builder.call(dot, [sums[len(grown)], pair, factor]))
+                return grown
+
+            sums = summed(builder, before, pairs, grow)
             for nth, (place, value) in enumerate(zip(places, sums, strict=True)):
-                if added:
-                    value = builder.fadd(value, added[nth % vectors])
+                if ending in ("full", "low", "relu"):
+                    bias = builder.add(n, INDEX(LONG * (nth % vectors)))
+                    value = builder.fadd(value, builder.load(ahead(builder, more, bias), align=4))
                 if ending == "relu":
-                    # Not-a-number stays.
-                    value = builder.select(builder.fcmp_ordered("<=", value, nothing), nothing, value)
+                    value = relu(builder, value)
                 if ending == "gate":
-                    seen = builder.load(_vector(builder, more, builder.add(place, n), _SHORTS), align=2)
-                    above = builder.icmp_signed(">", seen, ir.Constant(_SHORTS, [0] * 16))
+                    seen = builder.load(ahead(builder, more, builder.add(place, n), _SHORTS), align=2)
+                    above = builder.icmp_signed(">", seen, ir.Constant(_SHORTS, [0] * LONG))
                     value = builder.select(above, value, nothing)
                 if ending in ("full", "add"):
-                    builder.store(value, _vector(builder, out, place, _REALS), align=4)
+                    builder.store(value, ahead(builder, out, place), align=4)
                 else:
-                    builder.store(_lowered(builder, value), _vector(builder, out, place, _HALF), align=2)
+                    builder.store(_lowered(builder, value), ahead(builder, out, place, _HALF), align=2)
             return context.get_dummy_value()
 
         i = types.int64
@@ -212,11 +183,11 @@ def _zip(context: Any, x: Any, upper: Any, lower: Any, out: Any, to: Any) -> Any
             context.make_array(signature.args[k])(context, builder, arguments[k]).data for k in (0, 3)
         )
         halves = [
-            builder.zext(builder.load(_vector(builder, source, arguments[k], _SHORTS), align=2), _WORDS)
+            builder.zext(builder.load(ahead(builder, source, arguments[k], _SHORTS), align=2), _WORDS)
             for k in (1, 2)
         ]
         joined = builder.or_(halves[0], builder.shl(halves[1], ir.Constant(_WORDS, [16] * 16)))
-        builder.store(joined, _vector(builder, target, arguments[4], _WORDS), align=4)
+        builder.store(joined, ahead(builder, target, arguments[4], _WORDS), align=4)
         return context.get_dummy_value()
 
     i = types.int64
@@ -232,7 +203,7 @@ def lower(context: Any, array: Any, index: Any, value: Any) -> Any:
         data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
         index = context.cast(builder, arguments[1], signature.args[1], types.int64)
         low = _lowered(builder, arguments[2])
-        builder.store(low, _vector(builder, data, index, low.type), align=2)
+        builder.store(low, ahead(builder, data, index, low.type), align=2)
         return context.get_dummy_value()
 
     return types.void(array, index, value), generate

@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from backbones.kernels.compiler import inline, intrinsic
+from backbones.kernels.register_blocks import INDEX, LONG, REALS, ahead, everywhere, places_of, relu, summed
 
 __all__ = [
     "HIGH",
@@ -36,15 +37,11 @@ __all__ = [
 
 WIDEST = 512
 """Columns of the widest matrix."""
-# Columns of a vector.
-LONG = 16
 # Rows whose factors stay in the nearest caches, for products and for sums over rows.
 ROWS = 32
 SUMMED = 64
 # Tasks that share the rows of a sum.
 TASKS = 16
-_INDEX = ir.IntType(64)
-_REALS = ir.VectorType(ir.FloatType(), LONG)
 _FLAGS = ("contract", "nsz")
 
 
@@ -62,11 +59,6 @@ def _many_registers() -> bool:
 
 # Rows of a block of results, and vectors in each: 16 registers of results of 32, or 8 of 16.
 HIGH, _VECTORS = (8, 2) if _many_registers() else (4, 1)
-
-
-def _vector(builder: Any, pointer: Any, index: Any) -> Any:
-    """Pointer to a vector that begins at an element."""
-    return builder.bitcast(builder.gep(pointer, [index]), _REALS.as_pointer())
 
 
 def _block(vectors: int, ending: str) -> Any:
@@ -90,65 +82,41 @@ def _block(vectors: int, ending: str) -> Any:
                 for k in (0, 4, 9, 12)
             )
             _, at, down, along, _, begin, step, panel, count, _, to, row, _, n = arguments
-            places = [
-                builder.add(builder.add(to, builder.mul(row, _INDEX(r))), _INDEX(LONG * v))
-                for r in range(HIGH)
-                for v in range(vectors)
-            ]
-            nothing = ir.Constant(_REALS, [0.0] * LONG)
+            places = places_of(builder, to, row, HIGH, vectors)
+            nothing = ir.Constant(REALS, [0.0] * LONG)
             before = [nothing] * len(places)
             if ending == "add":
-                before = [builder.load(_vector(builder, out, place), align=4) for place in places]
-            entry = builder.block
-            head, body, end = (builder.append_basic_block(name) for name in ("steps", "step", "done"))
-            builder.branch(head)
-            builder.position_at_end(head)
-            number = builder.phi(_INDEX)
-            number.add_incoming(_INDEX(0), entry)
-            sums = []
-            for value in before:
-                sums.append(builder.phi(_REALS))
-                sums[-1].add_incoming(value, entry)
-            builder.cbranch(builder.icmp_signed("<", number, count), body, end)
-            builder.position_at_end(body)
-            first = builder.add(begin, builder.mul(number, step))
-            factors = []
-            for v in range(vectors):
-                place = builder.add(first, builder.mul(panel, _INDEX(v)))
-                factors.append(builder.load(_vector(builder, right, place), align=4))
-            start = builder.add(at, builder.mul(number, along))
-            undefined = ir.Constant(_REALS, ir.Undefined)
-            everywhere = ir.Constant(ir.VectorType(ir.IntType(32), LONG), [0] * LONG)
-            grown: list[Any] = []
-            for r in range(HIGH):
-                one = builder.load(builder.gep(left, [builder.add(start, builder.mul(down, _INDEX(r)))]))
-                one = builder.insert_element(undefined, one, ir.IntType(32)(0))
-                one = builder.shuffle_vector(one, undefined, everywhere)
-                for factor in factors:
-                    grown.append(
-                        builder.fadd(sums[len(grown)], builder.fmul(one, factor, flags=_FLAGS), flags=_FLAGS)
+                before = [builder.load(ahead(builder, out, place), align=4) for place in places]
+
+            def grow(number: Any, sums: Any) -> list[Any]:
+                first = builder.add(begin, builder.mul(number, step))
+                factors = [
+                    builder.load(
+                        ahead(builder, right, builder.add(first, builder.mul(panel, INDEX(v)))), align=4
                     )
-            number.add_incoming(builder.add(number, _INDEX(1)), body)
-            for value, larger in zip(sums, grown, strict=True):
-                value.add_incoming(larger, body)
-            builder.branch(head)
-            builder.position_at_end(end)
-            added = []
-            if ending in ("full", "relu"):
-                added = [
-                    builder.load(_vector(builder, more, builder.add(n, _INDEX(LONG * v))), align=4)
                     for v in range(vectors)
                 ]
+                start = builder.add(at, builder.mul(number, along))
+                grown: list[Any] = []
+                for r in range(HIGH):
+                    one = builder.load(builder.gep(left, [builder.add(start, builder.mul(down, INDEX(r)))]))
+                    one = everywhere(builder, one)
+                    for factor in factors:
+                        product = builder.fmul(one, factor, flags=_FLAGS)
+                        grown.append(builder.fadd(sums[len(grown)], product, flags=_FLAGS))
+                return grown
+
+            sums = summed(builder, before, count, grow)
             for nth, (place, value) in enumerate(zip(places, sums, strict=True)):
-                if added:
-                    value = builder.fadd(value, added[nth % vectors])
+                if ending in ("full", "relu"):
+                    bias = builder.add(n, INDEX(LONG * (nth % vectors)))
+                    value = builder.fadd(value, builder.load(ahead(builder, more, bias), align=4))
                 if ending == "relu":
-                    # Not-a-number stays.
-                    value = builder.select(builder.fcmp_ordered("<=", value, nothing), nothing, value)
+                    value = relu(builder, value)
                 if ending == "gate":
-                    seen = builder.load(_vector(builder, more, builder.add(place, n)), align=4)
+                    seen = builder.load(ahead(builder, more, builder.add(place, n)), align=4)
                     value = builder.select(builder.fcmp_ordered(">", seen, nothing), value, nothing)
-                builder.store(value, _vector(builder, out, place), align=4)
+                builder.store(value, ahead(builder, out, place), align=4)
             return context.get_dummy_value()
 
         i = types.int64
