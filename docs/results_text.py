@@ -106,8 +106,8 @@ STUDIES = (
         "best_background",
         "What stands behind the pictures while `best` trains",
         "Random colours that are drawn, or what these cost on average without their noise (`ExpectedBackground`), "
-        "which `best` has had since. The drawn ones are the runs of `best_full.yaml`, made on another machine, which changes "
-        "less: compare the first rows of `best_lean` and `best_cells`.",
+        "which `best` has had since. The drawn ones are the runs of `best_full.yaml`, made on another machine, which "
+        "changes less: compare the first rows of `best_lean` and `best_cells`.",
     ),
     (
         "best_views",
