@@ -48,8 +48,13 @@ def packed(batch: Batch, dtype: torch.dtype = torch.float64, **more: Any) -> Ray
         positions=colours,
         valid=torch.tensor(batch.valid),
         patch=PATCH,
-        **more,
+        **{"target_opacity": opacities(dtype), **more},
     )
+
+
+def opacities(dtype: torch.dtype = torch.float64) -> Tensor:
+    """Of the pixels that the rays are compared with; one is not known."""
+    return torch.linspace(0, 1, RAYS, dtype=dtype).index_fill(0, torch.tensor(5), float("nan"))
 
 
 def reorder(samples: RaySamples, order: Tensor) -> RaySamples:
@@ -61,7 +66,7 @@ def reorder(samples: RaySamples, order: Tensor) -> RaySamples:
         for name in ("t", "delta", "index", "density", "weights", "colours", "positions")
     }
     changes["offsets"] = torch.tensor([0, *np.cumsum([len(piece) for piece in pieces])])
-    for name in ("ray_start", "ray_steps"):
+    for name in ("ray_start", "ray_steps", "target_opacity"):
         changes[name] = getattr(samples, name)[order]
     return samples.replace(**changes)
 
@@ -123,7 +128,8 @@ def test_the_order_of_rays_does_not_matter(penalty: Regularizer, seed: int) -> N
 def test_empty_space_costs_nothing(penalty: Regularizer) -> None:
     batch = make_batch(4, RAYS, STEPS, kept=1.0)
     batch.density[:] = 0.0
-    assert penalty.penalty(packed(batch), context()).item() == pytest.approx(0.0, abs=2e-5)
+    samples = packed(batch, target_opacity=torch.zeros(RAYS, dtype=torch.float64))
+    assert penalty.penalty(samples, context()).item() == pytest.approx(0.0, abs=2e-5)
 
 
 @each
@@ -134,7 +140,9 @@ def test_descent_lowers_it(penalty: Regularizer) -> None:
     raw = torch.tensor(np.log(batch.density + 0.1), requires_grad=True)
     values = []
     for _ in range(30):
-        samples = RaySamples.from_dense(t, delta, raw.exp(), colours=colours, positions=colours, patch=PATCH)
+        samples = RaySamples.from_dense(
+            t, delta, raw.exp(), colours=colours, positions=colours, patch=PATCH, target_opacity=opacities()
+        )
         value = penalty.penalty(samples, context())
         values.append(value.item())
         (gradient,) = torch.autograd.grad(value, raw)
