@@ -68,8 +68,9 @@ def opacity_error(samples: RaySamples) -> Tensor:
 
     Example:
         >>> density = torch.tensor([[1e3], [0.0], [0.0]])
-        >>> samples = RaySamples.from_dense(torch.ones(1), torch.ones(1), density)
-        >>> round(opacity_error(samples.replace(target_opacity=torch.tensor([1.0, 1.0, float("nan")]))).item(), 4)
+        >>> alpha = torch.tensor([1.0, 1.0, float("nan")])
+        >>> samples = RaySamples.from_dense(torch.ones(1), torch.ones(1), density, target_opacity=alpha)
+        >>> round(opacity_error(samples).item(), 4)
         0.3333
     """
     target = samples.target_opacity

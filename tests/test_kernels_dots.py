@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.nn import functional as F
 
-from backbones.kernels import dot_blocks, dots, mlp
+from backbones.kernels import dots, mlp, register_blocks
 from backbones.kernels.dots import multiply, pack, weight_gradient
 
 native = pytest.mark.skipif(not dots.available(), reason="the processor has no dot products of bfloat16")
@@ -111,9 +111,9 @@ def test_perceptrons_agree_with_onednn(monkeypatch, width):
 
 def test_an_emulated_processor_is_not_trusted(monkeypatch):
     """numba may be told to compile for another processor than this one."""
-    dots.available.cache_clear()
-    monkeypatch.setattr(dot_blocks.config, "CPU_NAME", "generic")
+    register_blocks.has.cache_clear()
+    monkeypatch.setattr(register_blocks.config, "CPU_NAME", "generic")
     try:
         assert dots.available() is False
     finally:
-        dots.available.cache_clear()
+        register_blocks.has.cache_clear()

@@ -17,9 +17,10 @@ from hypothesis import strategies as st
 
 from backbones.kernels import Block, dot_blocks, encoded, encoded_mlp, fma_blocks
 from backbones.kernels.compiler import float32, kernel, next_task, uint16, vector
-from backbones.kernels.dot_blocks import HIGH, SUMMED, TASKS, lower
+from backbones.kernels.dot_blocks import HIGH, lower
 from backbones.kernels.linear import Layer
 from backbones.kernels.perceptron import fits, rows_of
+from backbones.kernels.register_blocks import SUMMED, TASKS
 from backbones.kernels.simd import LANES, load, wide
 from backbones.kernels.threading import launch
 
@@ -131,7 +132,6 @@ def test_numbers_do_not_depend_on_threads(precision):
 def test_blocks_of_rows_end_within_what_is_there():
     """Both passes read and write whole blocks of rows, and those of the backward pass begin anywhere."""
     assert HIGH >= fma_blocks.HIGH
-    assert (SUMMED, TASKS) == (fma_blocks.SUMMED, fma_blocks.TASKS)
     for count in range(1, 3000):
         ends = [-(-count // HIGH) * HIGH]
         for task in range(TASKS):

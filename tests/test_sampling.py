@@ -80,7 +80,7 @@ class TestExpectedBackground:
         density.requires_grad_()
         alpha = torch.rand(5, generator=generator, dtype=torch.float64)
         t = torch.arange(3, dtype=torch.float64)
-        samples = RaySamples.from_dense(t, torch.ones_like(t), density).replace(target_opacity=alpha)
+        samples = RaySamples.from_dense(t, torch.ones_like(t), density, target_opacity=alpha)
         colours = torch.rand(15, 3, generator=generator, dtype=torch.float64)
         seen = samples.sum_per_ray(samples.weights[:, None] * colours)
         wanted = torch.rand(5, 3, generator=generator, dtype=torch.float64) * alpha[:, None]

@@ -6,25 +6,32 @@ ends with what a layer needs: bias and ReLU, or the gate of a ReLU.
 
 from __future__ import annotations
 
-import functools
 from typing import Any
 
-from llvmlite import binding, ir  # type: ignore[import-untyped]
-from numba import config, types
+from llvmlite import ir  # type: ignore[import-untyped]
+from numba import types
 from numba.core import cgutils
 
 from backbones.kernels.bfloat16 import get
 from backbones.kernels.compiler import inline, int32, int64, intrinsic, uint16
-from backbones.kernels.register_blocks import INDEX, LONG, REALS, ahead, everywhere, places_of, relu, summed
+from backbones.kernels.register_blocks import (
+    INDEX,
+    LONG,
+    REALS,
+    SUMMED,
+    WIDEST,
+    ahead,
+    everywhere,
+    has,
+    places_of,
+    relu,
+    summed,
+)
 from backbones.kernels.simd import LANES, load, one, store, wide
 
 __all__ = [
     "HIGH",
     "PAIRS",
-    "ROWS",
-    "SUMMED",
-    "TASKS",
-    "WIDEST",
     "add_rows",
     "available",
     "full_one",
@@ -42,16 +49,8 @@ __all__ = [
     "take",
 ]
 
-WIDEST = 512
-"""Columns of the widest matrix."""
-
 # Rows of a block of results that stays in registers.
 HIGH = 8
-# Rows whose factors stay in the nearest cache, for products and for sums over rows.
-ROWS = 32
-SUMMED = 64
-# Tasks that share the rows of a sum.
-TASKS = 16
 # Pairs of the rows of a sum.
 PAIRS = SUMMED // 2 * WIDEST
 _WORD = ir.IntType(32)
@@ -76,16 +75,9 @@ _LOW, _HALF = ir.VectorType(_BFloat(), 32), ir.VectorType(_BFloat(), 16)
 _DOT, _CONVERT = "llvm.x86.avx512bf16.dpbf16ps.512", "llvm.x86.avx512bf16.cvtneps2bf16"
 
 
-@functools.cache
 def available() -> bool:
     """Whether numba compiles for a processor that has these instructions."""
-    name, features = config.CPU_NAME, config.CPU_FEATURES  # type: ignore[attr-defined]
-    if name not in (None, "host") or features is not None:
-        return False
-    try:
-        return bool(binding.get_host_cpu_features().get("avx512bf16", False))
-    except RuntimeError:
-        return False
+    return has("avx512bf16")
 
 
 def _lowered(builder: Any, value: Any) -> Any:

@@ -29,10 +29,6 @@ from backbones.kernels.compiler import (
 from backbones.kernels.dot_blocks import (
     HIGH,
     PAIRS,
-    ROWS,
-    SUMMED,
-    TASKS,
-    WIDEST,
     add_rows,
     available,
     full_one,
@@ -48,6 +44,7 @@ from backbones.kernels.dot_blocks import (
     sum_products,
     take,
 )
+from backbones.kernels.register_blocks import ROWS, SUMMED, TASKS, WIDEST
 from backbones.kernels.sums import fold
 from backbones.kernels.threading import launch
 

@@ -1,21 +1,33 @@
-"""Rows of positional encodings, side by side, written and read within the kernels of a perceptron.
+"""What the kernels of a perceptron have in common: their arguments, and rows of positional encodings, side by side.
 
-Encodings are bfloat16 or float32, as the array says that holds them.
+Rows are bfloat16 or float32, as the array says that holds them.
 """
 
 from __future__ import annotations
 
 from typing import Any
 
+from backbones.kernels.bfloat16 import put
 from backbones.kernels.compiler import float32, inline, int64, integer, vector
 from backbones.kernels.octaves import read_octaves, write_octaves
 from backbones.kernels.simd import LANES, load, one, wide
 from backbones.kernels.waves import sine_and_cosine
 
-__all__ = ["OF_BLOCK", "decode_rows", "encode_rows"]
+__all__ = ["AHEAD", "BACK", "OF_BLOCK", "OF_LAYER", "copy_rows", "decode_rows", "encode_rows"]
 
-OF_BLOCK = 4
-"""Arguments of a kernel for each block of encodings."""
+AHEAD, BACK = 5, 8
+"""Arguments of a forward and of a backward kernel before those of the blocks of encodings and of the layers."""
+
+OF_BLOCK, OF_LAYER = 4, 3
+"""Arguments for each block of encodings, and for each layer."""
+
+
+@inline
+def copy_rows(x: Any, width: Any, first: Any, count: Any, out: Any, wider: Any) -> Any:
+    """Copy rows of float32, with zeros behind them."""
+    for r in range(count):
+        for i in range(wider):
+            put(out, r * wider + i, x[(first + r) * width + i] if i < width else float32(0))
 
 
 @inline

@@ -6,24 +6,28 @@ it is follows from the registers that the processor has.
 
 from __future__ import annotations
 
-import functools
 from typing import Any
 
-from llvmlite import binding, ir  # type: ignore[import-untyped]
-from numba import config, types
+from llvmlite import ir  # type: ignore[import-untyped]
+from numba import types
 from torch import Tensor
 from torch.nn import functional as F
 
 from backbones.kernels.compiler import inline, intrinsic
-from backbones.kernels.register_blocks import INDEX, LONG, REALS, ahead, everywhere, places_of, relu, summed
+from backbones.kernels.register_blocks import (
+    INDEX,
+    LONG,
+    REALS,
+    ahead,
+    everywhere,
+    has,
+    places_of,
+    relu,
+    summed,
+)
 
 __all__ = [
     "HIGH",
-    "LONG",
-    "ROWS",
-    "SUMMED",
-    "TASKS",
-    "WIDEST",
     "full_one",
     "full_two",
     "gate_one",
@@ -35,30 +39,11 @@ __all__ = [
     "sum_products",
 ]
 
-WIDEST = 512
-"""Columns of the widest matrix."""
-# Rows whose factors stay in the nearest caches, for products and for sums over rows.
-ROWS = 32
-SUMMED = 64
-# Tasks that share the rows of a sum.
-TASKS = 16
 _FLAGS = ("contract", "nsz")
 
 
-@functools.cache
-def _many_registers() -> bool:
-    """Whether numba compiles for 32 registers of 16 float32 (AVX-512)."""
-    name, features = config.CPU_NAME, config.CPU_FEATURES  # type: ignore[attr-defined]
-    if name not in (None, "host") or features is not None:
-        return False
-    try:
-        return bool(binding.get_host_cpu_features().get("avx512f", False))
-    except RuntimeError:
-        return False
-
-
-# Rows of a block of results, and vectors in each: 16 registers of results of 32, or 8 of 16.
-HIGH, _VECTORS = (8, 2) if _many_registers() else (4, 1)
+# Rows of a block of results, and vectors in each: 16 registers of results of 32 (AVX-512), or 8 of 16.
+HIGH, _VECTORS = (8, 2) if has("avx512f") else (4, 1)
 
 
 def _block(vectors: int, ending: str) -> Any:

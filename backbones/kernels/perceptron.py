@@ -17,6 +17,7 @@ from torch.autograd.function import once_differentiable
 
 from backbones.kernels import dot_blocks, dots, fma_blocks, perceptron_dots, perceptron_float
 from backbones.kernels.compiler import Kernel
+from backbones.kernels.register_blocks import ROWS, TASKS, WIDEST
 from backbones.kernels.simd import LANES
 from backbones.kernels.sums import fold
 from backbones.kernels.threading import launch
@@ -24,10 +25,8 @@ from backbones.kernels.workspace import room
 
 __all__ = ["Block", "fits", "gradients", "perceptron", "rows_of"]
 
-# Of a block of results, and of tasks: the larger ones of both precisions.
-_HIGH, _ROWS, _TASKS, _WIDEST = dot_blocks.HIGH, dot_blocks.ROWS, dot_blocks.TASKS, dot_blocks.WIDEST
-assert (_ROWS, _TASKS, _WIDEST) == (fma_blocks.ROWS, fma_blocks.TASKS, fma_blocks.WIDEST)
-assert fma_blocks.HIGH <= _HIGH
+# Of a block of results, the higher of both precisions.
+_HIGH = max(dot_blocks.HIGH, fma_blocks.HIGH)
 
 
 class Block(NamedTuple):
@@ -82,7 +81,7 @@ def _encoded_width(blocks: Sequence[Block]) -> int:
 def fits(blocks: Sequence[Block], layers: Sequence[Any], dtype: torch.dtype) -> bool:
     """Whether the processor and the sizes allow it in a precision."""
     widest = max(_encoded_width(blocks), *(_up(weight.shape[0], 16) for weight, _ in layers))
-    return widest <= _WIDEST and (dtype == torch.float32 or dot_blocks.available())
+    return widest <= WIDEST and (dtype == torch.float32 or dot_blocks.available())
 
 
 def _padded(x: Tensor) -> Tensor:
@@ -123,11 +122,11 @@ def gradients(
         high = _up(weight.shape[0], 16)
         back = weight if number else weight[:, :columns]
         places.append((place, place + high * x.shape[1], high, x.shape[1]))
-        arguments += [kind.pack(back.t(), high) if back.shape[1] else none, x, place, weight.shape[0]]
+        arguments += [kind.pack(back.t(), high) if back.shape[1] else none, x, place]
         place += high * (x.shape[1] + 1)
-    sums = room("perceptron", _TASKS, place)
+    sums = room("perceptron", TASKS, place)
     launch(
-        kind.backward, _TASKS, count, len(blocks), len(weights), inputs[0], gradient, columns,
+        kind.backward, TASKS, count, len(blocks), len(weights), inputs[0], gradient, columns,
         torch.zeros(_up(columns, 16)), sums, *arguments,
     )  # fmt: skip
     found = fold(sums)
@@ -163,9 +162,9 @@ class _Perceptron(Function):
             if place + 2 < len(flat):
                 output = torch.empty(len(encoded), high, dtype=dtype)
                 inputs.append(output)
-            arguments += [kind.pack(weight, inputs[place // 2].shape[1]), more, output, weight.shape[1]]
+            arguments += [kind.pack(weight, inputs[place // 2].shape[1]), more, output]
         out = torch.empty(len(encoded), _up(weights[-1].shape[0], 16))
-        tasks = -(-count // _ROWS)
+        tasks = -(-count // ROWS)
         launch(kind.forward, tasks, count, len(blocks), len(weights), encoded, out, *arguments)
         ctx.inputs, ctx.weights = inputs, weights
         ctx.blocks = [(b.x.shape[1], b.octaves, b.width) for b in blocks]

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from backbones.kernels.bfloat16 import store_low
 from backbones.kernels.compiler import (
     float32,
-    inline,
     int32,
     int64,
     integer,
@@ -20,10 +18,6 @@ from backbones.kernels.compiler import (
 )
 from backbones.kernels.dot_blocks import (
     PAIRS,
-    ROWS,
-    SUMMED,
-    TASKS,
-    WIDEST,
     add_rows,
     full_one,
     full_two,
@@ -38,32 +32,39 @@ from backbones.kernels.dot_blocks import (
     relu_two,
     sum_products,
 )
-from backbones.kernels.encoded_rows import OF_BLOCK, decode_rows, encode_rows
+from backbones.kernels.encoded_rows import (
+    AHEAD,
+    BACK,
+    OF_BLOCK,
+    OF_LAYER,
+    copy_rows,
+    decode_rows,
+    encode_rows,
+)
+from backbones.kernels.register_blocks import ROWS, SUMMED, TASKS, WIDEST
 
 __all__ = ["backward", "forward"]
 
-# Arguments of a kernel before those of the blocks, and of each layer.
-_AHEAD, _BACK, _OF_LAYER = 5, 8, 4
 _TILE = SUMMED * WIDEST
 
 
 @kernel
 def forward(table: Any) -> None:
     """Rows, blocks, layers, encoded, out; of blocks x, rows, dims, octaves; of layers packed weight,
-    bias, output, columns of the input."""
+    bias, output."""
     rows, blocks, depth = integer(table, 0), integer(table, 1), integer(table, 2)
     encoded, out = vector(table, 3, uint16), vector(table, 4, float32)
-    layers = _AHEAD + OF_BLOCK * blocks
+    layers = AHEAD + OF_BLOCK * blocks
     while True:
         task = next_task(table)
         if task < 0:
             break
         first = task * ROWS
         count = min(int64(ROWS), rows - first)
-        encode_rows(table, _AHEAD, blocks, first, count, encoded, size(table, 3, 1), lower)
+        encode_rows(table, AHEAD, blocks, first, count, encoded, size(table, 3, 1), lower)
         read, pairs = encoded, size(table, 3, 1) // 2
         for layer in range(depth):
-            place = layers + _OF_LAYER * layer
+            place = layers + OF_LAYER * layer
             weight, bias = vector(table, place, int32), vector(table, place + 1, float32)
             columns = 16 * size(table, place, 0)
             at, to = first * pairs, first * columns
@@ -75,25 +76,16 @@ def forward(table: Any) -> None:
                 product(read, at, pairs, count, weight, columns, out, to, bias, 0, 1, full_two, full_one)
 
 
-@inline
-def _lower(x: Any, width: Any, first: Any, count: Any, out: Any, wider: Any) -> Any:
-    """Copy rows of float32 to bfloat16, with zeros behind them."""
-    for r in range(count):
-        for i in range(wider):
-            value = x[(first + r) * width + i] if i < width else float32(0)
-            store_low(out, r * wider + i, value)
-
-
 @kernel
 def backward(table: Any) -> None:
     """Rows, blocks, layers, encoded, gradient of out, columns of the encodings' gradient, zeros, sums ``(tasks, S)``;
     of blocks result, first column, dims, octaves; of layers packed transposed weight, input, place of its
-    sum, columns of the output."""
+    sum."""
     rows, blocks, depth = integer(table, 0), integer(table, 1), integer(table, 2)
     encoded, gradient = vector(table, 3, uint16), vector(table, 4, float32)
     given, columns, zeros = size(table, 4, 1), integer(table, 5), vector(table, 6, float32)
     sums, stride = vector(table, 7, float32), size(table, 7, 1)
-    layers = _BACK + OF_BLOCK * blocks
+    layers = BACK + OF_BLOCK * blocks
     these, those = scratch(_TILE, uint16), scratch(_TILE, uint16)
     of_slope, of_x = scratch(PAIRS, int32), scratch(PAIRS, int32)
     while True:
@@ -107,9 +99,9 @@ def backward(table: Any) -> None:
             count = min(int64(SUMMED), end - first)
             pairs = -(-count // 2)
             slope, other, high = these, those, -(-given // 16) * 16
-            _lower(gradient, given, first, count, slope, high)
+            copy_rows(gradient, given, first, count, slope, high)
             for layer in range(depth - 1, -1, -1):
-                place = layers + _OF_LAYER * layer
+                place = layers + OF_LAYER * layer
                 x, width = vector(table, place + 1, uint16), size(table, place + 1, 1)
                 at = task * stride + integer(table, place + 2)
                 pair_rows(slope, high, 0, count, of_slope, 16, high)
@@ -125,4 +117,4 @@ def backward(table: Any) -> None:
             if columns > 0:
                 weight, wider = vector(table, layers, int32), 16 * size(table, layers, 0)
                 product(slope, 0, high // 2, count, weight, wider, other, 0, zeros, 0, 1, low_two, low_one)
-                decode_rows(table, _BACK, blocks, first, count, encoded, size(table, 3, 1), other, wider)
+                decode_rows(table, BACK, blocks, first, count, encoded, size(table, 3, 1), other, wider)

@@ -1,19 +1,56 @@
-"""What blocks of matrix products have in common whose results stay in registers: the loop, and adding a bias."""
+"""What blocks of matrix products have in common whose results stay in registers: their sizes, and the loop."""
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from llvmlite import ir  # type: ignore[import-untyped]
+from llvmlite import binding, ir  # type: ignore[import-untyped]
+from numba import config
 
-__all__ = ["INDEX", "LONG", "REALS", "ahead", "everywhere", "places_of", "relu", "summed"]
+__all__ = [
+    "INDEX",
+    "LONG",
+    "REALS",
+    "ROWS",
+    "SUMMED",
+    "TASKS",
+    "WIDEST",
+    "ahead",
+    "everywhere",
+    "has",
+    "places_of",
+    "relu",
+    "summed",
+]
+
+WIDEST = 512
+"""Columns of the widest matrix."""
+
+# Rows whose factors stay in the nearest caches, for products and for sums over rows.
+ROWS = 32
+SUMMED = 64
+# Tasks that share the rows of a sum.
+TASKS = 16
 
 LONG = 16
 """Columns of a vector of results."""
 INDEX = ir.IntType(64)
 REALS = ir.VectorType(ir.FloatType(), LONG)
 _WORD = ir.IntType(32)
+
+
+@functools.cache
+def has(feature: str) -> bool:
+    """Whether numba compiles for this processor, and it has a feature, as LLVM calls it."""
+    name, features = config.CPU_NAME, config.CPU_FEATURES  # type: ignore[attr-defined]
+    if name not in (None, "host") or features is not None:
+        return False
+    try:
+        return bool(binding.get_host_cpu_features().get(feature, False))
+    except RuntimeError:
+        return False
 
 
 def ahead(builder: Any, pointer: Any, index: Any, like: Any = REALS) -> Any:
