@@ -12,6 +12,7 @@ import argparse
 import json
 import sys
 import tempfile
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from speed.whole_run import Spans
 from gridreg.cli import ending
 from gridreg.rendering.backends import use_backend
 from gridreg.training import StepReport, configure, execute, open_scene
+from gridreg.training.checkpoint import has_checkpoint
 from gridreg.training.files import write_json
 from gridreg.training.options import TrainOptions
 
@@ -55,6 +57,7 @@ def score(
     backend: str,
     changes: tuple[str, ...],
     keep: Path | None = None,
+    resume: bool = False,
 ) -> None:
     name = run if backend == "auto" else f"{run}-{backend}"
     target = result_path(folder.name, name, seed, steps, protocol, changes)
@@ -76,7 +79,8 @@ def score(
     use_backend(backend)
     with ExitStack() as stack:
         out = stack.enter_context(tempfile.TemporaryDirectory()) if keep is None else keep / target.stem
-        _, metrics = execute(config, scene, out, watch=spans)
+        stopped = resume and has_checkpoint(Path(out) / "checkpoint")
+        _, metrics = execute(config, scene, out, resume=stopped, watch=spans)
     if metrics is None:
         raise KeyboardInterrupt
     # Peak memory is that of the process, which may have done other runs before.
@@ -92,6 +96,7 @@ def score(
         run,
         "--seeds",
         str(seed),
+        *([] if protocol == "dietnerf8" else ["--protocol", protocol]),
         *([] if steps is None else ["--steps", str(steps)]),
         *([] if backend == "auto" else ["--backend", backend]),
         *(["--set", *changes] if changes else []),
@@ -120,7 +125,7 @@ def table() -> None:
         print(row(json.loads(path.read_text())))
 
 
-def main() -> int:
+def main(words: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -138,13 +143,20 @@ def main() -> int:
     parser.add_argument(
         "--keep", type=Path, metavar="DIR", help="keep the output folders of the runs here, pictures included"
     )
+    parser.add_argument(
+        "--resume",
+        action="store_true",
+        help="go on with runs that were stopped, where --keep has their folder",
+    )
     parser.add_argument("--table", action="store_true", help="print what is stored, and end")
-    arguments = parser.parse_args()
+    arguments = parser.parse_args(words)
     if arguments.table:
         table()
         return 0
     if arguments.data is None:
         parser.error("--data: expected the folder that holds the scenes")
+    if arguments.resume and arguments.keep is None:
+        parser.error("--resume: expected the folder of the stopped runs with --keep")
     if arguments.threads:
         torch.set_num_threads(arguments.threads)
     for seed in arguments.seeds:
@@ -161,6 +173,7 @@ def main() -> int:
                     arguments.backend,
                     changes,
                     arguments.keep,
+                    arguments.resume,
                 )
     return 0
 

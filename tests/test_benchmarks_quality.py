@@ -1,0 +1,81 @@
+"""The benchmark of quality: a run that was stopped goes on, and its record says how it was made."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+from gridreg.scenes import builtin_scene
+from tests.programs import ROOT, module_at
+
+SMALL = (
+    "field.density_components=4",
+    "field.appearance_components=4",
+    "train.voxels_start=4096",
+    "train.voxels_end=4096",
+    "train.rays=64",
+)
+
+
+@pytest.fixture(scope="module")
+def program() -> ModuleType:
+    return module_at(ROOT / "benchmarks" / "quality.py")
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return builtin_scene(tmp_path_factory.mktemp("data"), size=24)
+
+
+def run(program: ModuleType, place: Path, keep: Path, *, resume: bool) -> None:
+    program.score(place, "quick", 0, 12, "builtin8", "auto", SMALL, keep, resume)
+
+
+def test_a_stopped_run_goes_on(
+    program: ModuleType, place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(program, "RESULTS", tmp_path / "whole")
+    run(program, place, tmp_path / "kept whole", resume=True)  # there is nothing to go on with yet
+    (whole,) = [json.loads(path.read_text()) for path in (tmp_path / "whole").iterdir()]
+
+    monkeypatch.setattr(program, "RESULTS", tmp_path / "stopped")
+    each = program.Trained.step
+
+    def interrupted(self: Any, report: Any) -> None:
+        each(self, report)
+        if self.run.trainer.step == 7:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(program.Trained, "step", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            run(program, place, tmp_path / "kept", resume=False)
+    assert not (tmp_path / "stopped").exists()
+    run(program, place, tmp_path / "kept", resume=True)
+    (resumed,) = [json.loads(path.read_text()) for path in (tmp_path / "stopped").iterdir()]
+    assert resumed["images"] == whole["images"]
+    assert resumed["command"] == whole["command"]
+    assert resumed["spans"][0]["from"] == 7
+
+
+def test_the_command_says_the_protocol(
+    program: ModuleType, place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(program, "RESULTS", tmp_path)
+    run(program, place, tmp_path / "kept", resume=False)
+    (path,) = tmp_path.glob("*.json")
+    command = json.loads(path.read_text())["command"]
+    assert command[command.index("--protocol") + 1] == "builtin8"
+
+
+def test_resume_needs_a_place(program: ModuleType, place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        program.main(["--data", str(place.parent), "--scenes", place.name, "--resume"])
+    assert ended.value.code == 2
+    assert "--keep" in capsys.readouterr().err
