@@ -196,10 +196,11 @@ def verdict(gains: Sequence[float], claimed: float) -> str:
 def claims(runs: Runs) -> str:
     """A verdict for every claim."""
     rows = []
-    for text, scenes, protocol, run, base, claimed in CLAIMS:
-        gains = runs.gains(scenes, protocol, run, base)
+    for claim in CLAIMS:
+        gains = runs.gains(claim.scenes, claim.protocol, claim.run, claim.base, claim.base_protocol)
         seen = f"{with_interval(estimate(gains))} ({len(gains)})" if gains else "–"
-        rows.append([text, signed(claimed) if claimed else "", seen, verdict(gains, claimed)])
+        told = signed(claim.claimed) if claim.claimed else ""
+        rows.append([claim.text, told, seen, verdict(gains, claim.claimed)])
     return RULE + table(["claim", "published (dB)", "ours (dB; pairs)", "verdict"], rows)
 
 

@@ -46,11 +46,13 @@ class Runs:
         found = [pick(record) for record in self.of(scene, protocol, run).values()]
         return estimate(found) if found else None
 
-    def gains(self, scenes: Sequence[str], protocol: str, run: str, base: str) -> list[float]:
+    def gains(
+        self, scenes: Sequence[str], protocol: str, run: str, base: str, base_protocol: str | None = None
+    ) -> list[float]:
         """Differences of PSNR (dB) of two runs, over the pairs of scene and seed that both have."""
         pairs = []
         for scene in scenes:
-            ours, theirs = self.of(scene, protocol, run), self.of(scene, protocol, base)
+            ours, theirs = self.of(scene, protocol, run), self.of(scene, base_protocol or protocol, base)
             pairs += [psnr(ours[seed]) - psnr(theirs[seed]) for seed in sorted(ours.keys() & theirs.keys())]
         return pairs
 

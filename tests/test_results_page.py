@@ -55,6 +55,8 @@ def test_gains_are_paired(results: ModuleType, tmp_path: Path) -> None:
     store(tmp_path, "tensorf", "chair", 0, 99.0)
     found = results.Runs(tmp_path).gains(("lego", "chair"), "dietnerf8", "few_tensorf", "tensorf")
     assert found == [2.0, 2.5]
+    store(tmp_path, "tensorf", "lego", 1, 30.0, protocol="views50")
+    assert results.Runs(tmp_path).gains(("lego",), "views50", "tensorf", "tensorf", "dietnerf8") == [5.5]
     text = results.claims(results.Runs(tmp_path))
     assert "| +3.05 | +2.25 [−0.93, +5.43] (2) | in sign in every pair, too few to be sure |" in text
 
