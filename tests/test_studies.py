@@ -77,6 +77,7 @@ ROWS = {
         "best", "opacity entropy 0.001", "ray entropy 0.001", "weight decay 0.01",
         "later resampling", "rates are not reset", "spatial annealing", "twice as many rays in half as many iterations",
     ],
+    "best_precision": ["float32", "bfloat16"],
     "best_components": ["best", "24 components of appearance"],
     "best_background": ["drawn backgrounds", "backgrounds in expectation"],
     "best_full": ["best", "distortion 0.01", "learning rate of grids 0.04", "total variation 0.006"],
