@@ -66,6 +66,17 @@ FRONT = (
 )
 """Runs that README.md shows, and what it says of each."""
 
+TARGETS = (
+    ("dietnerf8", "few_tensorf_finetuned", {"lego": 25.7, "chair": 27.7}),
+    ("dietnerf8", "best", {"lego": 27.5, "chair": 30.0}),
+)
+"""Mean test PSNR (dB) that was aimed at: protocol, run, and the least on each scene."""
+
+TARGETS_SAID = """What was aimed at, by the mean of the seeds. That of `few_tensorf_finetuned` is what was published for the fine-tuned
+row. The same for bodies stands among the claims.
+
+"""
+
 ENSEMBLES = """The mean of the fields of several seeds (`gridreg ensemble`), scored on the same test views by
 `benchmarks/ensembles.py`. Training takes as long as that of its members. In films of lego from 5 degrees above the
 ground and of chair (`quick`), specks beside thin parts and the grain of the cloth are fainter than in one seed; what no
