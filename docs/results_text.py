@@ -72,8 +72,8 @@ TARGETS = (
 )
 """Mean test PSNR (dB) that was aimed at: protocol, run, and the least on each scene."""
 
-TARGETS_SAID = """What was aimed at, by the mean of the seeds. That of `few_tensorf_finetuned` is what was published for the fine-tuned
-row. The same for bodies stands among the claims.
+TARGETS_SAID = """What was aimed at, by the mean of the seeds. That of `few_tensorf_finetuned` is what was published for the
+fine-tuned row. The same for bodies stands among the claims.
 
 """
 
@@ -116,10 +116,10 @@ STUDIES = (
     (
         "best_background",
         "What stands behind the pictures while `best` trains",
-        "Random colours that are drawn, or what these cost on average without their noise (`ExpectedBackground`), which "
-        "`best` has had since. At full length they are alike. After 1,000 iterations, where noise counts for more, the "
-        "first row of `best_others` is ahead of that of `best_lean`, which draws. (This page once compared runs of two "
-        "processors here, and called the difference a gain.)",
+        "Random colours that are drawn, or what these cost on average without their noise (`ExpectedBackground`), "
+        "which `best` has had since. At full length they are alike. After 1,000 iterations, where noise counts for "
+        "more, the first row of `best_others` is ahead of that of `best_lean`, which draws. (This page once compared "
+        "runs of two processors here, and called the difference a gain.)",
     ),
     (
         "best_views",

@@ -66,12 +66,10 @@ def test_targets_are_reached_by_the_mean_of_seeds(results: ModuleType, tmp_path:
         store(tmp_path, "best", "lego", seed, lego)
         store(tmp_path, "best", "chair", seed, chair)
     rows = [line for line in results.targets(results.Runs(tmp_path)).splitlines() if "`best`" in line]
-    assert rows[0].startswith("| `best`, lego, dietnerf8 | 27.5 | 27.55 ±") and rows[0].endswith(
-        "(2) | yes |"
-    )
-    assert rows[1].startswith("| `best`, chair, dietnerf8 | 30.0 | 29.95 ±") and rows[1].endswith(
-        "(2) | no |"
-    )
+    assert rows[0].startswith("| `best`, lego, dietnerf8 | 27.5 | 27.55 ±")
+    assert rows[0].endswith("(2) | yes |")
+    assert rows[1].startswith("| `best`, chair, dietnerf8 | 30.0 | 29.95 ±")
+    assert rows[1].endswith("(2) | no |")
     assert "| `few_tensorf_finetuned`, lego, dietnerf8 | 25.7 | – | – |" in results.targets(
         results.Runs(tmp_path)
     )
