@@ -72,8 +72,8 @@ TARGETS = (
 )
 """Mean test PSNR (dB) that was aimed at: protocol, run, and the least on each scene."""
 
-TARGETS_SAID = """What was aimed at, by the mean of the seeds. That of `few_tensorf_finetuned` is what was published for the
-fine-tuned row. The same for bodies stands among the claims.
+TARGETS_SAID = """What was aimed at, by the mean of the seeds; for `few_tensorf_finetuned` what was published for the
+fine-tuned row. Bodies stand among the claims.
 
 """
 
