@@ -217,6 +217,10 @@ scenes, so they are not part of the project.
 * lego, `best` (the same view, 29.4 dB): no fog and no haze. What is left: edges one pixel wide, the gaps of the
   tracks and of the grille, the inner wall of the bucket, a little soft. The worst views are the low ones from the
   side (24.6 dB) and the one from behind and above (24.1 dB).
+* lego and chair with settings of SANeRF (r_144, 21.7 dB; the chair from 21.2 to 31.2 dB): the studs in lego's bucket
+  are smeared into brown stripes, the cabin, the front and the tracks are torn; from behind and above (r_0, r_184) the
+  cabin is patched with wrong colours. The chair's legs are eaten away or hang as loose specks beside it, there is a
+  white gap between seat and back, and the back's plain side is streaked.
 * chair, `tensorf` (r_152, 27.3 dB): closed, patterns readable, a little darker than it is. A green patch hangs above
   the chair in views from behind and above (r_0, r_168 to r_192): the rest of a wall right before a training camera.
 * chair, `few_tensorf_10k` (the same view, 25.6 dB): no wall. White wood before the white background can be seen
@@ -229,6 +233,12 @@ scenes, so they are not part of the project.
   back are a little too bright all over: their sheen is seen from one direction by one training view.
 * chair and lego, `best-long` (r_72, 25.8 dB, and r_160, 27.6 dB; r_144, 29.9 dB, and r_72, 26.0 dB): the faults of
   `best`, fainter; on lego the studs on top, one pixel wide, and the line below the ground plate stand out.
+* chair with `fewtensorf8` (r_152: `tensorf` 23.7, `best` 25.9 dB): from the front, where those views are few, `tensorf`
+  mixes pattern and ground of the cloth into one mottled green, and legs and edges are frayed; `best` keeps the pattern,
+  but the rim below the seat and the right leg are broken, and the seat is too bright on its right.
+* lego with `fewtensorf8`, `best` (r_128, 21.5 dB; r_40, 34.5 dB): in low views the plate is thicker than it is, because
+  no training view looks from there; wheels, the front and the shovel's arm are blurred where they are hidden, a faint
+  haze lies under the plate.
 * chair, `few_tensorf_finetuned` (r_152, 28.8 dB): legs and rim are whole, cloth and ornaments readable; the right edge
   of the back is grainy, specks hang between armrest and back.
 * lego, `few_tensorf_finetuned` (r_144, 26.9 dB; r_80, 23.0 dB): plate, tracks and grille are cleaner than TensoRF's,
