@@ -75,8 +75,8 @@ ROWS = {
     ],
     "best_others": [
         "best", "opacity entropy 0.001", "ray entropy 0.001", "weight decay 0.01",
-        "later resampling", "earlier resampling", "rates are not reset", "spatial annealing", "twice as many rays in half as many iterations",
-        "four octaves of the direction",
+        "later resampling", "earlier resampling", "rates are not reset", "spatial annealing",
+        "twice as many rays in half as many iterations", "four octaves of the direction",
     ],
     "best_precision": ["float32", "bfloat16"],
     "best_components": ["best", "24 components of appearance"],
