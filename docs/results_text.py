@@ -239,9 +239,9 @@ scenes, so they are not part of the project.
   that the white shows through, and so is the back's foot. `best` keeps pattern and wood; the rim and the right leg are
   broken, and the seat is too bright on its right.
 * lego with `fewtensorf8` (r_128: `tensorf` 21.2, `few_tensorf_10k` 20.9, `best` 21.5 dB), from low, where no training
-  view looks from: all three make the plate thicker than it is. Under it hang streaks of fog in `few_tensorf_10k`, specks
-  in rows in `tensorf` and a faint haze in `best`. Wheels and front are blotched and bleached by `tensorf`, blotched by
-  `few_tensorf_10k` and blurred by `best`.
+  view looks from: all three make the plate thicker than it is. Under it hang streaks of fog in `few_tensorf_10k`,
+  specks in rows in `tensorf` and a faint haze in `best`. Wheels and front are blotched and bleached by `tensorf`,
+  blotched by `few_tensorf_10k` and blurred by `best`.
 * chair, `few_tensorf_finetuned` (r_152, 28.8 dB): legs and rim are whole, cloth and ornaments readable; the right edge
   of the back is grainy, specks hang between armrest and back.
 * lego, `few_tensorf_finetuned` (r_144, 26.9 dB; r_80, 23.0 dB): plate, tracks and grille are cleaner than TensoRF's,
