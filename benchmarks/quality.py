@@ -29,6 +29,8 @@ from gridreg.training.files import write_json
 from gridreg.training.options import TrainOptions
 
 RESULTS = Path(__file__).parent / "results" / "quality"
+PROTOCOL = "dietnerf8"
+"""Where none is named."""
 
 
 class Trained(Spans):
@@ -96,7 +98,7 @@ def score(
         run,
         "--seeds",
         str(seed),
-        *([] if protocol == "dietnerf8" else ["--protocol", protocol]),
+        *([] if protocol == PROTOCOL else ["--protocol", protocol]),
         *([] if steps is None else ["--steps", str(steps)]),
         *([] if backend == "auto" else ["--backend", backend]),
         *(["--set", *changes] if changes else []),
@@ -135,7 +137,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--steps", type=int)
     parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="such as field.decoder=mlp")
-    parser.add_argument("--protocol", default="dietnerf8")
+    parser.add_argument("--protocol", default=PROTOCOL)
     parser.add_argument("--threads", type=int)
     parser.add_argument(
         "--backend", choices=("auto", "torch"), default="auto", help="torch: train by the plain path"

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent))
+from results_claims import claims, targets
 from results_runs import (
     ENSEMBLE_STORE,
     STORE,
@@ -31,17 +32,13 @@ from results_runs import (
 from results_text import (
     BODIES,
     BODY_METHODS,
-    CLAIMS,
     ENSEMBLES,
     FRONT,
     HEAD,
     METHODS,
     PICTURES,
-    RULE,
     SCENES,
     STUDIES,
-    TARGETS,
-    TARGETS_SAID,
 )
 
 from gridreg.ablation.statistics import estimate
@@ -88,17 +85,6 @@ def bodies(runs: Runs) -> str:
         found = [runs.mean(scene, protocol, run, psnr) for scene in BODIES]
         rows.append([name, *(with_spread(value) for value in found)])
     return table(["method", *(f"{scene}: PSNR (seeds)" for scene in BODIES)], rows)
-
-
-def targets(runs: Runs) -> str:
-    """What was aimed at, and whether the mean of the seeds is there."""
-    rows = []
-    for protocol, run, least in TARGETS:
-        for scene, target in least.items():
-            found = runs.mean(scene, protocol, run, psnr)
-            reached = "–" if found is None else "yes" if found.mean >= target else "no"
-            rows.append([f"`{run}`, {scene}, {protocol}", f"{target:.1f}", with_spread(found), reached])
-    return TARGETS_SAID + table(["run", "target (dB)", "ours (dB; seeds)", "reached"], rows)
 
 
 def study_tables(folder: Path = STUDY_STORE) -> str:
@@ -188,33 +174,6 @@ def beside_plain(folder: Path = STORE) -> str:
         "the kernels. "
         f"Mean difference: {with_interval(estimate(gains))} dB.\n\n" + table(head, rows)
     )
-
-
-def verdict(gains: Sequence[float], claimed: float) -> str:
-    """What our pairs say about a claimed gain, dB; the rule stands on the page."""
-    if not gains:
-        return "not measured"
-    found = estimate(gains)
-    if found.half_width is None:
-        return "one pair: no verdict"
-    if found.low > 0:
-        return "holds" if found.high >= claimed else "holds in sign, but is smaller"
-    if found.high < 0:
-        return "the opposite"
-    if max(gains) < 0:
-        return "the opposite in every pair, too few to be sure"
-    return "in sign in every pair, too few to be sure" if min(gains) > 0 else "within noise"
-
-
-def claims(runs: Runs) -> str:
-    """A verdict for every claim."""
-    rows = []
-    for claim in CLAIMS:
-        gains = runs.gains(claim.scenes, claim.protocol, claim.run, claim.base, claim.base_protocol)
-        seen = f"{with_interval(estimate(gains))} ({len(gains)})" if gains else "–"
-        told = signed(claim.claimed) if claim.claimed else ""
-        rows.append([claim.text, told, seen, verdict(gains, claim.claimed)])
-    return RULE + table(["claim", "published (dB)", "ours (dB; pairs)", "verdict"], rows)
 
 
 def page(runs: Runs) -> str:

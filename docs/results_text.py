@@ -1,4 +1,4 @@
-"""What docs/results.md says besides figures: its rows, claims and studies, and what was seen in the pictures."""
+"""What docs/results.md says besides figures: its rows and studies, and what was seen in the pictures."""
 
 from __future__ import annotations
 
@@ -65,17 +65,6 @@ FRONT = (
     ("few_tensorf", ", 15,000 iterations"),
 )
 """Runs that README.md shows, and what it says of each."""
-
-TARGETS = (
-    ("dietnerf8", "few_tensorf_finetuned", {"lego": 25.7, "chair": 27.7}),
-    ("dietnerf8", "best", {"lego": 27.5, "chair": 30.0}),
-)
-"""Mean test PSNR (dB) that was aimed at: protocol, run, and the least on each scene."""
-
-TARGETS_SAID = """What was aimed at, by the mean of the seeds; for `few_tensorf_finetuned` what was published for the
-fine-tuned row. Bodies stand among the claims.
-
-"""
 
 ENSEMBLES = """The mean of the fields of several seeds (`gridreg ensemble`), scored on the same test views by
 `benchmarks/ensembles.py`. Training takes as long as that of its members. In films of lego from 5 degrees above the
@@ -193,12 +182,6 @@ STUDIES = (
     ),
 )
 
-RULE = """A claimed gain *holds* if the interval of our paired differences lies above 0 and reaches the claim; it *holds
-in sign* if it lies above 0 and below the claim; *the opposite* is an interval below 0; one that has 0 inside is *within
-noise*, unless all pairs have one sign, which two or three of them may have by chance.
-
-"""
-
 PICTURES = """
 ## What the pictures show
 
@@ -260,71 +243,3 @@ scenes, so they are not part of the project.
   speck is larger. `few_tensorf_finetuned` (32.0 dB) has TensoRF's wrong dots, fewer of them, and no fog. `human` has
   every dot; hem and hair are a little soft.
 """
-
-
-@dataclass(frozen=True)
-class Claim:
-    """A gain in PSNR that somebody claims: of which run over which other, and how much (dB).
-
-    Both are trained and scored on the same scenes with the same seeds, under one protocol unless the other has its own.
-    """
-
-    text: str
-    scenes: tuple[str, ...]
-    protocol: str
-    run: str
-    base: str
-    claimed: float = 0.0
-    base_protocol: str | None = None
-
-
-CLAIMS = (
-    Claim(
-        "Few TensoRF, raw, gains over TensoRF (lego 1.85, chair 4.25)",
-        SCENES, "dietnerf8", "few_tensorf", "tensorf", 3.05,
-    ),
-    Claim(
-        "Few TensoRF, fine-tuned, gains over TensoRF (lego 1.90, chair 4.26)",
-        SCENES, "dietnerf8", "few_tensorf_10k", "tensorf", 3.08,
-    ),
-    Claim(
-        "10,000 iterations (fine-tuned) are better than 15,000 (raw) (lego 0.05, chair 0.01)",
-        SCENES, "dietnerf8", "few_tensorf_10k", "few_tensorf", 0.03,
-    ),
-    Claim(
-        "With the authors' own views: Few TensoRF, fine-tuned, gains over TensoRF",
-        SCENES, "fewtensorf8", "few_tensorf_10k", "tensorf", 3.08,
-    ),
-    Claim(
-        "Masks in blocks gain over those printed (not published)",
-        SCENES, "dietnerf8", "few_tensorf", "few_tensorf:few_tensorf_printed",
-    ),
-    Claim(
-        "Bodies: TensoRF with 50 views gains over 8 (12.61 and 11.30)",
-        BODIES, "human50", "tensorf", "tensorf", 11.96, "human8",
-    ),
-    Claim(
-        "Bodies: TensoRF at 8 views gains over Few TensoRF with the fixed ratio (1.00 and 0.28)",
-        BODIES, "human8", "tensorf", "few_tensorf_10k:few_tensorf_fixed", 0.64,
-    ),
-    Claim(
-        "Bodies: masks fixed at 0.8 gain over masks that open (not published)",
-        BODIES, "human8", "few_tensorf_10k:few_tensorf_fixed", "few_tensorf_10k",
-    ),
-    Claim(
-        "`few_tensorf_finetuned` gains over TensoRF",
-        SCENES, "dietnerf8", "few_tensorf_finetuned", "tensorf",
-    ),
-    Claim(
-        "Bodies: `few_tensorf_finetuned` gains over TensoRF at 8 views (our target: 0)",
-        BODIES, "human8", "few_tensorf_finetuned", "tensorf",
-    ),
-    Claim(
-        "`best` gains over `few_tensorf_finetuned`",
-        SCENES, "dietnerf8", "best", "few_tensorf_finetuned",
-    ),
-    Claim(
-        "`human` gains over TensoRF at 8 views (our target: 1.5)",
-        BODIES, "human8", "human", "tensorf", 1.5,
-    ),
-)  # fmt: skip
