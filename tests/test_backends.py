@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gridreg.errors import InputError
-from gridreg.rendering import backends, plain
+from gridreg.rendering import choice, plain
 from gridreg.rendering.backends import (
     Backend,
     accumulate,
@@ -31,8 +31,8 @@ F = np.float32
 @pytest.fixture(autouse=True)
 def _plain_only(monkeypatch: pytest.MonkeyPatch) -> None:
     """These tests see the plain versions, whatever was imported before them."""
-    monkeypatch.setattr(backends, "_BACKENDS", {"torch": backends._BACKENDS["torch"]})
-    monkeypatch.setattr(backends, "_choice", "auto")
+    monkeypatch.setattr(choice, "_BACKENDS", {"torch": choice._BACKENDS["torch"]})
+    monkeypatch.setattr(choice, "_choice", "auto")
 
 
 def march_by_hand(o, d, t_min, t_max, step, cells, bounds, jitter):
@@ -228,7 +228,7 @@ class TestChoice:
         with pytest.raises(InputError, match="import backbones"):
             use_backend("compiled")
         with pytest.raises(InputError, match="'torch'"):
-            register_backend("torch", backends._TORCH)
+            register_backend("torch", choice._TORCH)
 
     def test_function_and_context(self):
         use_backend("torch")
@@ -251,8 +251,8 @@ class TestChoice:
         composite_weights(tau.float(), offsets)
         assert calls == []
         register_backend("compiled", Backend(plain.march, compiled, plain.accumulate, plain.terminate))
-        for choice in ("auto", "compiled", "torch"):
-            with use_backend(choice):
+        for name in ("auto", "compiled", "torch"):
+            with use_backend(name):
                 composite_weights(tau.float(), offsets)
                 composite_weights(tau, offsets)
         assert calls == [torch.float32] * 2

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from backbones.kernels import composite
-from gridreg.rendering import backends, plain
+from gridreg.rendering import backends, choice, plain
 
 counts_lists = st.lists(st.sampled_from([0, 0, 1, 2, 7, 40]), max_size=150)
 
@@ -163,7 +163,7 @@ def test_two_python_threads_at_once():
 
 
 def test_register(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(backends, "_BACKENDS", {"torch": backends._BACKENDS["torch"]})
+    monkeypatch.setattr(choice, "_BACKENDS", {"torch": choice._BACKENDS["torch"]})
     composite.register()
     tau, values, offsets = random_packed(7, [5, 0, 9])
     weights = backends.composite_weights(tau, offsets)

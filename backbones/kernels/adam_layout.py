@@ -5,7 +5,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-__all__ = ["Layout", "Moments", "Neighbours", "Terms", "layout"]
+__all__ = ["PIECE", "Layout", "Moments", "Neighbours", "Terms", "layout"]
+
+# Elements worked on at a time: all that one piece reads and writes stays in the first-level cache.
+PIECE = 1024
 
 
 class Layout(NamedTuple):

@@ -12,7 +12,6 @@ from llvmlite import ir  # type: ignore[import-untyped]
 from numba import types
 from numba.core import cgutils
 
-from backbones.kernels.bfloat16 import get
 from backbones.kernels.compiler import inline, int32, int64, intrinsic, uint16
 from backbones.kernels.register_blocks import (
     INDEX,
@@ -27,12 +26,11 @@ from backbones.kernels.register_blocks import (
     relu,
     summed,
 )
-from backbones.kernels.simd import LANES, load, one, store, wide
+from backbones.kernels.simd import LANES, load, store, wide
 
 __all__ = [
     "HIGH",
     "PAIRS",
-    "add_rows",
     "available",
     "full_one",
     "full_two",
@@ -294,14 +292,3 @@ def sum_products(of_slope: Any, high: Any, of_x: Any, width: Any, pairs: Any, ou
             _add_two(of_slope, n, 1, high, of_x, k * pairs, pairs, out, to + k, width, out, 0)
         if both < width:
             _add_one(of_slope, n, 1, high, of_x, both * pairs, pairs, out, to + both, width, out, 0)
-
-
-@inline
-def add_rows(x: Any, width: Any, first: Any, count: Any, totals: Any, total: Any) -> Any:
-    """Add rows of x, ``width`` wide, bfloat16 or float32, to the totals from ``total`` on."""
-    split = width - width % LANES
-    for at in range(first * width, (first + count) * width, width):
-        for n in range(0, split, LANES):
-            store(totals, total + n, load(totals, total + n, wide()) + get(x, at + n, wide()))
-        for n in range(split, width):
-            totals[total + n] += get(x, at + n, one())

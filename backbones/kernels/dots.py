@@ -29,7 +29,6 @@ from backbones.kernels.compiler import (
 from backbones.kernels.dot_blocks import (
     HIGH,
     PAIRS,
-    add_rows,
     available,
     full_one,
     full_two,
@@ -45,7 +44,7 @@ from backbones.kernels.dot_blocks import (
     take,
 )
 from backbones.kernels.register_blocks import ROWS, SUMMED, TASKS, WIDEST
-from backbones.kernels.sums import fold
+from backbones.kernels.sums import add_rows, fold
 from backbones.kernels.threading import launch
 
 __all__ = ["WIDEST", "available", "multiply", "pack", "weight_gradient"]

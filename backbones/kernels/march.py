@@ -15,7 +15,6 @@ from backbones.kernels.compiler import (
     cube,
     exact,
     float32,
-    inline,
     int64,
     kernel,
     matrix,
@@ -24,10 +23,11 @@ from backbones.kernels.compiler import (
     uint8,
     vector,
 )
+from backbones.kernels.marked import Marked, distance_of, next_bit, sample_at
 from backbones.kernels.threading import launch
 from gridreg.rendering.plain import CELL_TOLERANCE, steps_bound
 
-__all__ = ["Marked", "distance_of", "mark", "march", "next_bit", "sample_at"]
+__all__ = ["mark", "march"]
 
 # Edge, in cells, of the blocks that are skipped whole when nothing in them is occupied.
 _COARSE = np.uint32(4)
@@ -35,7 +35,6 @@ _TOLERANCE = np.float32(CELL_TOLERANCE)
 # Relative rounding of a position computed in float32 by a handful of operations, with room to spare.
 _ROUNDING = np.float32(2e-6)
 _ONE = np.int64(1)
-_REST = np.int64(2**63 - 1)
 _ZERO_F, _ONE_F = np.float32(0), np.float32(1)
 _INFINITE = np.float32(np.inf)
 # Rays of one task.
@@ -154,40 +153,6 @@ def _mark(table: Any) -> None:
             )
 
 
-@exact
-def sample_at(o: Any, d: Any, axis: Any, distance: Any) -> Any:
-    """Coordinate of a sample along an axis."""
-    return o[axis] + distance * d[axis]
-
-
-@exact
-def distance_of(near: Any, shift: Any, step: Any, index: Any) -> Any:
-    """Distance of sample ``index`` along its ray."""
-    return near + (np.float32(index) + shift) * step
-
-
-@inline
-def next_bit(bits: Any, after: Any) -> Any:
-    """The first index from ``after`` on whose bit is set; 64 for each word if there is none."""
-    words = bits.shape[0]
-    word = after >> 6
-    rest = int64(0)
-    if word < words:
-        # The sign bit would be shifted in for ever.
-        low = after & 63
-        rest = bits[word] if low == 0 else (bits[word] >> low) & (_REST >> (low - 1))
-    while rest == 0:
-        word += 1
-        if word >= words:
-            return 64 * words
-        after = 64 * word
-        rest = bits[word]
-    while rest & 1 == 0:
-        rest = (rest >> 1) & _REST
-        after += 1
-    return after
-
-
 @kernel
 def _fill(table: Any) -> None:
     """Write out the marked samples of blocks of rays."""
@@ -206,24 +171,6 @@ def _fill(table: Any) -> None:
                 index[n], t[n] = i, distance_of(near[ray], shift[ray], step, i)
                 for axis in range(3):
                     x[n, axis] = sample_at(o[ray], d[ray], axis, t[n])
-
-
-class Marked(NamedTuple):
-    """The samples of a march before they are written out.
-
-    Args:
-        origins, directions: ``(R, 3)``, contiguous.
-        near, shift: ``(R,)``; sample ``index`` lies at ``near + (index + shift) * step``.
-        bits: ``(R, words)`` int64; bit i of word w is set if index ``64 w + i`` is kept.
-        offsets: ``(R + 1,)`` int64; the samples of ray r are ``offsets[r] : offsets[r + 1]``.
-    """
-
-    origins: Tensor
-    directions: Tensor
-    near: Tensor
-    shift: Tensor
-    bits: Tensor
-    offsets: Tensor
 
 
 class _Blocks(NamedTuple):

@@ -18,7 +18,6 @@ from backbones.kernels.compiler import (
 )
 from backbones.kernels.dot_blocks import (
     PAIRS,
-    add_rows,
     full_one,
     full_two,
     gate_one,
@@ -42,6 +41,7 @@ from backbones.kernels.encoded_rows import (
     encode_rows,
 )
 from backbones.kernels.register_blocks import ROWS, SUMMED, TASKS, WIDEST
+from backbones.kernels.sums import add_rows
 
 __all__ = ["backward", "forward"]
 

@@ -14,7 +14,6 @@ from backbones.kernels.compiler import (
     size,
     vector,
 )
-from backbones.kernels.dot_blocks import add_rows
 from backbones.kernels.encoded_rows import (
     AHEAD,
     BACK,
@@ -36,6 +35,7 @@ from backbones.kernels.fma_blocks import (
 )
 from backbones.kernels.register_blocks import LONG, ROWS, SUMMED, TASKS, WIDEST
 from backbones.kernels.simd import store
+from backbones.kernels.sums import add_rows
 
 __all__ = ["backward", "forward"]
 

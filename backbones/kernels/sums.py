@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from backbones.kernels.bfloat16 import get
 from backbones.kernels.compiler import (
     float32,
     inline,
@@ -23,10 +24,21 @@ from backbones.kernels.compiler import (
 from backbones.kernels.simd import LANES, load, one, store, wide
 from backbones.kernels.threading import launch
 
-__all__ = ["fold", "thin"]
+__all__ = ["add_rows", "fold", "thin"]
 
 # Elements of one task.
 _PIECE = 4096
+
+
+@inline
+def add_rows(x: Any, width: Any, first: Any, count: Any, totals: Any, total: Any) -> Any:
+    """Add rows of x, ``width`` wide, bfloat16 or float32, to the totals from ``total`` on."""
+    split = width - width % LANES
+    for at in range(first * width, (first + count) * width, width):
+        for n in range(0, split, LANES):
+            store(totals, total + n, load(totals, total + n, wide()) + get(x, at + n, wide()))
+        for n in range(split, width):
+            totals[total + n] += get(x, at + n, one())
 
 
 @inline

@@ -30,7 +30,7 @@ from backbones.kernels.compiler import (
     vector,
 )
 from backbones.kernels.cp import product_sum
-from backbones.kernels.march import Marked, distance_of, next_bit, sample_at
+from backbones.kernels.marked import Marked, distance_of, next_bit, sample_at
 from backbones.kernels.places import BATCH, PLACES, find
 from backbones.kernels.simd import LANES, load, store, wide
 from backbones.kernels.softplus import softplus

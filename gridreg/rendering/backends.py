@@ -6,15 +6,21 @@ versions are the reference: a registered one must return the same samples, and t
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from types import TracebackType
-
 import torch
 from torch import Tensor
 
 from gridreg.errors import InputError
 from gridreg.rendering import plain
+from gridreg.rendering.choice import (
+    Backend,
+    Marched,
+    backend_for,
+    chosen_backend,
+    register_backend,
+    registered_backends,
+    takes_compiled,
+    use_backend,
+)
 
 __all__ = [
     "Backend",
@@ -31,102 +37,6 @@ __all__ = [
     "terminate",
     "use_backend",
 ]
-
-Marched = tuple[Tensor, Tensor, Tensor, Tensor]
-
-
-@dataclass(frozen=True)
-class Backend:
-    """One implementation of the inner loops; signatures as of the functions of the same name."""
-
-    march: Callable[[Tensor, Tensor, Tensor, Tensor, float, Tensor, Tensor, Tensor | float], Marched]
-    composite_weights: Callable[[Tensor, Tensor], Tensor]
-    accumulate: Callable[[Tensor, Tensor, Tensor], Tensor]
-    terminate: Callable[[Tensor, Tensor, float], Tensor]
-    pool: Callable[[Tensor, Tensor, float, float, torch.Generator | None], tuple[Tensor, Tensor, Tensor]] = (
-        plain.pool
-    )
-    spread: Callable[[Tensor, Tensor, Tensor], Tensor] = plain.spread
-    pixels: Callable[[Tensor, Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor]] = plain.pixels
-
-
-_TORCH = Backend(plain.march, plain.composite_weights, plain.accumulate, plain.terminate)
-_BACKENDS: dict[str, Backend] = {"torch": _TORCH}
-_CHOICES = ("auto", "compiled", "torch")
-_choice = "auto"
-
-
-def register_backend(name: str, backend: Backend) -> None:
-    """Make ``backend`` available as ``name``; a second registration replaces the first.
-
-    Raises:
-        InputError: for any name but "compiled"; "torch" is the reference and cannot be replaced.
-    """
-    if name != "compiled":
-        raise InputError(
-            f"backend name: found {name!r}, expected 'compiled' ('torch' is the fixed reference)"
-        )
-    _BACKENDS[name] = backend
-
-
-def registered_backends() -> tuple[str, ...]:
-    """Names of the backends that can be chosen now."""
-    return tuple(sorted(_BACKENDS))
-
-
-def chosen_backend() -> str:
-    """The name given to the last `use_backend` that is still in force: "auto" by default."""
-    return _choice
-
-
-class use_backend:
-    """Choose the implementation of the inner loops, for good or for the length of a ``with`` block.
-
-    The choice holds for the whole process: a viewer's thread follows the trainer's.
-
-    Args:
-        name: "torch" forces the plain versions; "compiled" and "auto" take the compiled ones for CPU float32
-            tensors and the plain ones for all others, "auto" also while nothing compiled is registered.
-
-    Raises:
-        InputError: for an unknown name, or for "compiled" while nothing is registered under it.
-
-    Example:
-        >>> with use_backend("torch"):
-        ...     chosen_backend()
-        'torch'
-        >>> chosen_backend()
-        'auto'
-    """
-
-    def __init__(self, name: str) -> None:
-        global _choice
-        if name not in _CHOICES:
-            raise InputError(f"backend: found {name!r}, expected one of {', '.join(_CHOICES)}")
-        if name == "compiled" and "compiled" not in _BACKENDS:
-            raise InputError(
-                "backend 'compiled': nothing is registered, expected `import backbones.kernels` before"
-            )
-        self._previous = _choice
-        _choice = name
-
-    def __enter__(self) -> use_backend:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        global _choice
-        _choice = self._previous
-
-
-def takes_compiled(*tensors: Tensor) -> bool:
-    """Whether the choice allows compiled code for these tensors: all on the CPU, all float32."""
-    return _choice != "torch" and all(x.is_cpu and x.dtype == torch.float32 for x in tensors)
-
-
-def _backend(*tensors: Tensor) -> Backend:
-    return _BACKENDS.get("compiled", _TORCH) if takes_compiled(*tensors) else _TORCH
 
 
 def march(
@@ -171,7 +81,7 @@ def march(
         ([0, 2], [2, 3], [2.5, 3.5])
     """
     plain.check_march(origins, directions, t_min, t_max, step, cells, bounds, jitter)
-    backend = _backend(origins, directions, t_min, t_max, bounds)
+    backend = backend_for(origins, directions, t_min, t_max, bounds)
     return backend.march(origins, directions, t_min, t_max, step, cells, bounds, jitter)
 
 
@@ -197,7 +107,7 @@ def composite_weights(optical_depth: Tensor, offsets: Tensor) -> Tensor:
         [0.5, 0.25]
     """
     plain.check_packed(optical_depth, offsets, "optical_depth")
-    return _backend(optical_depth).composite_weights(optical_depth, offsets)
+    return backend_for(optical_depth).composite_weights(optical_depth, offsets)
 
 
 def accumulate(weights: Tensor, values: Tensor, offsets: Tensor) -> Tensor:
@@ -221,7 +131,7 @@ def accumulate(weights: Tensor, values: Tensor, offsets: Tensor) -> Tensor:
     plain.check_packed(weights, offsets, "weights")
     if values.dim() != 2 or values.shape[0] != weights.shape[0]:
         raise InputError(f"values: found shape {tuple(values.shape)}, expected ({weights.shape[0]}, K)")
-    return _backend(weights, values).accumulate(weights, values, offsets)
+    return backend_for(weights, values).accumulate(weights, values, offsets)
 
 
 def pixels(
@@ -255,7 +165,7 @@ def pixels(
     ):
         if tuple(value.shape) != shape:
             raise InputError(f"{name}: found shape {tuple(value.shape)}, expected {shape}")
-    return _backend(weights, colours, t, background).pixels(weights, colours, t, background, offsets)
+    return backend_for(weights, colours, t, background).pixels(weights, colours, t, background, offsets)
 
 
 def terminate(optical_depth: Tensor, offsets: Tensor, bound: float) -> Tensor:
@@ -277,7 +187,7 @@ def terminate(optical_depth: Tensor, offsets: Tensor, bound: float) -> Tensor:
         [True, True, False]
     """
     plain.check_packed(optical_depth, offsets, "optical_depth")
-    return _backend(optical_depth).terminate(optical_depth, offsets, bound)
+    return backend_for(optical_depth).terminate(optical_depth, offsets, bound)
 
 
 def pool(
@@ -309,7 +219,7 @@ def pool(
         [[0, 3, 4], [0, 0, 1], [0, 1, -1, 1, 2]]
     """
     plain.check_packed(weights, offsets, "weights")
-    return _backend(weights).pool(weights, offsets, floor, bound, generator)
+    return backend_for(weights).pool(weights, offsets, floor, bound, generator)
 
 
 def spread(colours: Tensor, pools: Tensor, speakers: Tensor) -> Tensor:
@@ -326,4 +236,4 @@ def spread(colours: Tensor, pools: Tensor, speakers: Tensor) -> Tensor:
         >>> spread(torch.tensor([[0.5], [1.0]]), torch.tensor([0, -1, 1, 1]), torch.tensor([0, 2])).tolist()
         [[0.5], [0.0], [1.0], [1.0]]
     """
-    return _backend(colours).spread(colours, pools, speakers)
+    return backend_for(colours).spread(colours, pools, speakers)
