@@ -211,6 +211,10 @@ scenes, so they are not part of the project.
   22.6 dB). With an occlusion loss that counts 20 samples from the box, the front legs are eaten away as well.
 * chair, `few_tensorf` (r_72, 21.9 dB; r_160, 24.0 dB): the rim below the seat and the edges of the seat are torn into
   streaks, front legs and armrests are grey and can be seen through; no wall.
+* chair, masks as printed (r_112, 25.0 dB; r_72, 21.9 dB): the seat's green shows through the plain back, the rim below
+  the seat hangs in strips, legs and armrests are frayed; no wall. Settings of FourieRF (r_64, 19.8 dB; r_112, 23.6 dB):
+  seen from the side of no training view, the white wood is grey, brown and transparent, cloth shows through the back,
+  and an edge of faint fog stands beside the chair, where the box ends.
 * chair, `best` (r_64, 26.0 dB; r_152, 30.1 dB): upright, closed, patterns readable. The ornaments are blurred where
   they sit on thin wood, the shadow side of the legs is hazy, the armrest's cloth has lost its pattern, and seat and
   back are a little too bright all over: their sheen is seen from one direction by one training view.
