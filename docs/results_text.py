@@ -136,7 +136,8 @@ STUDIES = (
     (
         "best_others",
         "Remedies that `best` does without",
-        "Of others, added or changed one at a time.",
+        "Of others, added or changed one at a time. Weight decay changes less than seeds do. All else loses on both "
+        "scenes: a blur that clears (spatial annealing) and the entropy of rays most, resampling later or earlier alike.",
     ),
     (
         "best_precision",
@@ -238,7 +239,8 @@ scenes, so they are not part of the project.
   pocket, leaves a fringe between the legs and grey patches in the face. With masks fixed at 0.8 the white lines of the
   shirt are torn into dashes, face and trousers are blotched. `few_tensorf_finetuned` (36.5 dB) and `human`
   err at outlines; the former a little at the pocket and between the legs as well.
-* subject_a with 50 views, `tensorf` (39.1 to 41.8 dB): sharp all over; no fault can be seen in the sheet of all views.
+* subject_a and subject_b with 50 views, `tensorf` (39.1 to 41.8 and 36.2 to 38.7 dB): sharp all over; no fault can be
+  seen in the sheets of all views.
 * subject_a, `few_tensorf_10k` with masks that open over the run (22.4 to 24.3 dB): the body is grey, and rags of mist
   hang around it. Colour has died: lines of appearance ended below 0.011 everywhere, those of density reach 1 and more.
   Likely the penalty on their orthogonality did it, while they were hidden from the pictures.
