@@ -137,7 +137,7 @@ STUDIES = (
         "best_others",
         "Remedies that `best` does without",
         "Of others, added or changed one at a time. Weight decay changes less than seeds do. All else loses on both "
-        "scenes: a blur that clears (spatial annealing) and the entropy of rays most, resampling later or earlier alike.",
+        "scenes: a blur that clears (spatial annealing) and the entropy of rays most, resampling at other times, too.",
     ),
     (
         "best_precision",
