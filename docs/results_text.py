@@ -241,9 +241,10 @@ scenes, so they are not part of the project.
   err at outlines; the former a little at the pocket and between the legs as well.
 * subject_a and subject_b with 50 views, `tensorf` (39.1 to 41.8 and 36.2 to 38.7 dB): sharp all over; no fault can be
   seen in the sheets of all views.
-* subject_a, `few_tensorf_10k` with masks that open over the run (22.4 to 24.3 dB): the body is grey, and rags of mist
-  hang around it. Colour has died: lines of appearance ended below 0.011 everywhere, those of density reach 1 and more.
-  Likely the penalty on their orthogonality did it, while they were hidden from the pictures.
+* subject_a and subject_b, `few_tensorf_10k` with masks that open over the run (22.4 to 24.3 and 20.7 to 23.6 dB): the
+  body is grey, and rags of mist hang around it. Colour has died: on subject_a the lines of appearance ended below 0.011
+  everywhere, those of density reach 1 and more. Likely the penalty on their orthogonality did it, while they were
+  hidden from the pictures.
 * subject_b (0019: 30.8, 26.5, 32.5 dB): TensoRF puts wrong dots on the skirt where one view sees it, and a speck of fog
   floats beside it. With fixed masks the dots run into each other, stripes of the sleeves can be seen through, the
   speck is larger. `few_tensorf_finetuned` (32.0 dB) has TensoRF's wrong dots, fewer of them, and no fog. `human` has
