@@ -1,4 +1,4 @@
-"""Write docs/results.md and the table in README.md from the runs stored in benchmarks/results.
+"""Write docs/results.md and the tables in README.md from the runs stored in benchmarks/results.
 
 python docs/make_results.py            write both
 python docs/make_results.py --check    exit with status 1 if one is stale
@@ -34,6 +34,7 @@ from results_text import (
     BODY_METHODS,
     ENSEMBLES,
     FRONT,
+    GAINS,
     HEAD,
     METHODS,
     PICTURES,
@@ -228,13 +229,28 @@ def front_table(runs: Runs, ensemble_store: Path = ENSEMBLE_STORE) -> str:
     return table(["run", *(f"{scene}: PSNR (seeds) / SSIM / minutes; threads" for scene in SCENES)], rows)
 
 
+def front_gains(runs: Runs) -> str:
+    """What README.md shows besides: gains over plain TensoRF, of pairs of the same views and seed."""
+    places = [("dietnerf8", scene) for scene in SCENES] + [("fewtensorf8", scene) for scene in SCENES]
+    places += [("human8", scene) for scene in BODIES]
+    rows = []
+    for run in GAINS:
+        gains = [runs.gains([scene], protocol, run, "tensorf") for protocol, scene in places]
+        if any(gains):
+            rows.append(
+                [f"`{run}`", *(f"{signed(estimate(g).mean)} ({len(g)})" if g else "–" for g in gains)]
+            )
+    head = ["gain over `tensorf`, dB (pairs)", *(f"{scene}, `{protocol}`" for protocol, scene in places)]
+    return table(head, rows)
+
+
 def with_front(readme: str, runs: Runs) -> str:
-    """README.md with its table renewed, between the marks around it."""
+    """README.md with its tables renewed, between the marks around them."""
     before, begin, rest = readme.partition(BEGIN)
     _, end, after = rest.partition(END)
     if not begin or not end:
         raise ValueError(f"README.md: found no table between {BEGIN!r} and {END!r}")
-    return f"{before}{begin}\n{front_table(runs)}{end}{after}"
+    return f"{before}{begin}\n{front_table(runs)}\n{front_gains(runs)}{end}{after}"
 
 
 def main(words: Sequence[str] | None = None) -> int:

@@ -58,6 +58,7 @@ BODY_METHODS = (
 
 FRONT = (
     ("best", ", 3,000 iterations"),
+    ("best --steps 1800", ""),
     ("best-long", ", 12,000 iterations"),
     ("quick", ", 1,200 iterations, 200^3"),
     ("tensorf", ", 15,000 iterations"),
@@ -66,6 +67,16 @@ FRONT = (
     ("few_tensorf", ", 15,000 iterations"),
 )
 """Runs that README.md shows, and what it says of each."""
+
+GAINS = (
+    "best",
+    "human",
+    "few_tensorf_finetuned",
+    "few_tensorf_10k",
+    "few_tensorf",
+    "few_tensorf_10k:few_tensorf_fixed",
+)
+"""Runs whose gains over TensoRF README.md shows."""
 
 ENSEMBLES = """The mean of the fields of several seeds (`gridreg ensemble`), scored on the same test views by
 `benchmarks/ensembles.py`. Training takes as long as that of its members. In films of lego from 5 degrees above the

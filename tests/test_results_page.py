@@ -142,6 +142,21 @@ def test_the_readme_has_the_same_figures(results: ModuleType, tmp_path: Path) ->
         results.with_front("Nothing.", results.Runs(runs))
 
 
+def test_the_readme_has_gains_over_tensorf(results: ModuleType, tmp_path: Path) -> None:
+    for seed, (ours, plain) in enumerate([(28.0, 27.0), (29.0, 27.5)]):
+        store(tmp_path, "best", "lego", seed, ours)
+        store(tmp_path, "tensorf", "lego", seed, plain)
+    store(tmp_path, "best", "lego", 2, 40.0)
+    store(tmp_path, "human", "subject_b", 0, 32.0, protocol="human8")
+    store(tmp_path, "tensorf", "subject_b", 0, 32.5, protocol="human8")
+    rows = results.front_gains(results.Runs(tmp_path)).splitlines()
+    assert rows[0].startswith("| gain over `tensorf`, dB (pairs) | lego, `dietnerf8` | chair, `dietnerf8` |")
+    assert rows[2:] == [
+        "| `best` | +1.25 (2) | – | – | – | – | – |",
+        "| `human` | – | – | – | – | – | −0.50 (1) |",
+    ]
+
+
 def test_paths_are_compared_at_equal_steps_and_seeds(results: ModuleType, tmp_path: Path) -> None:
     assert results.beside_plain(tmp_path) == ""
     plain = ["quality.py", "--steps", "150", "--backend", "torch"]
