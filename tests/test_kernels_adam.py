@@ -261,3 +261,20 @@ def test_blocks_do_not_matter(monkeypatch):
         monkeypatch.setattr(adam_update, "_BLOCKS", blocks)
         results.append(TestExactness().run(2)[0])
     assert all(torch.equal(results[0], other) for other in results[1:])
+
+
+def test_together_as_one_by_one():
+    """Parameters of one step do not see each other, with and without neighbours, also beside one that has no blocks."""
+    shapes = {(40, 9, 16): (0, 1), (5, 6, 7, 4): (0, 1, 2), (1, 30, 3): (1,), (70, 8): (), (2, 3): (0,)}
+    together = [grid(shape, seed) for seed, shape in enumerate(shapes)]
+    apart = [torch.nn.Parameter(p.detach().clone()) for p in together]
+    joint, alone = FusedAdam(together, lr=0.1), [FusedAdam([p], lr=0.1) for p in apart]
+    for step in range(3):
+        terms, values = [], {}
+        for p, q, optimizer, axes in zip(together, apart, alone, shapes.values(), strict=True):
+            kind, name = ("total_variation" if axes else "l1"), str(p.shape)
+            p.grad, q.grad = gradient(p, step), gradient(q, step)
+            terms.append(LocalTerm(kind, 2.0, p, axes, name))
+            values |= optimizer.step(local_terms=[LocalTerm(kind, 2.0, q, axes, name)])
+        assert joint.step(local_terms=terms) == values
+        assert all(torch.equal(p, q) for p, q in zip(together, apart, strict=True))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
@@ -26,9 +27,9 @@ def _axes(term: LocalTerm) -> tuple[int, ...]:
     return tuple(sorted(axis % dim for axis in term.spatial)) if term.kind == "total_variation" else ()
 
 
-def _pairs(p: Tensor, axis: int) -> int:
+def _pairs(shape: Sequence[int], axis: int) -> int:
     """Number of neighbour pairs along an axis."""
-    return p.numel() // p.shape[axis] * (p.shape[axis] - 1)
+    return math.prod(shape) // shape[axis] * (shape[axis] - 1)
 
 
 def _add_plainly(term: LocalTerm, gradient: Tensor) -> float:
@@ -42,7 +43,7 @@ def _add_plainly(term: LocalTerm, gradient: Tensor) -> float:
         return term.scale * float(p.double().square().mean())
     value = 0.0
     for axis in _axes(term):
-        n, pairs = p.shape[axis], _pairs(p, axis)
+        n, pairs = p.shape[axis], _pairs(p.shape, axis)
         if pairs:
             difference = p.diff(dim=axis)
             factor = 2 * term.scale / pairs
@@ -60,32 +61,59 @@ def _step_plainly(p: Tensor, g: Tensor, m: Tensor, v: Tensor, s: Moments) -> Non
     p.addcdiv_(m, v.sqrt().mul_(s.root).add_(s.eps), value=-s.rate)
 
 
+class _Form(NamedTuple):
+    """How the kernel sees a parameter and its terms.
+
+    Args:
+        shape: of the tensors.
+        apart: places of terms that it cannot take.
+        members: by place, the columns of the kernel's sums that make the value of a term.
+        counts: by column, what the sum is divided by.
+    """
+
+    shape: Layout
+    apart: tuple[int, ...]
+    members: dict[int, tuple[int, ...]]
+    counts: tuple[float, ...]
+
+
+@functools.lru_cache(maxsize=256)
+def _form(shape: tuple[int, ...], terms: tuple[tuple[str, tuple[int, ...]], ...]) -> _Form:
+    """Of a parameter's shape, and kinds and axes of its terms."""
+    axes: tuple[int, ...] = next((axes for _, axes in terms if axes and layout(shape, axes)), ())
+    found = layout(shape, axes)
+    assert found is not None
+    # Of slabs, rows and nodes, in the order of `axes`: two axes have no rows, one has slabs alone.
+    columns = {0: (), 1: (0,), 2: (0, 2), 3: (0, 1, 2)}[len(axes)]
+    counts = [1.0] * 3 + [float(math.prod(shape))] * 2
+    for column, axis in zip(columns, axes, strict=True):
+        counts[column] = max(1, _pairs(shape, axis))
+    by_kind = {"total_variation": columns, "l1": (3,), "l2": (4,)}
+    apart = tuple(i for i, (kind, own) in enumerate(terms) if kind == "total_variation" and own != axes)
+    members = {i: by_kind[kind] for i, (kind, _) in enumerate(terms) if i not in apart}
+    return _Form(found, apart, members, tuple(counts))
+
+
 class _Plan(NamedTuple):
     """A step of the kernel.
 
     Args:
         job: what it does.
-        shape: of the tensors.
+        form: of its parameter and terms.
         terms: whose values are wanted.
         values: of each term, as far as they are known.
-        members: by place in terms, the columns of the kernel's sums that make its value.
-        counts: by column, what the sum is divided by.
     """
 
     job: Job
-    shape: Layout
+    form: _Form
     terms: Sequence[LocalTerm]
     values: list[float]
-    members: dict[int, tuple[int, ...]]
-    counts: list[float]
 
-    def finish(self, sums: Tensor) -> list[float]:
-        """Values of the terms, from the kernel's sums by parts."""
-        if self.members:
-            found = sums.sum(0).tolist()
-            for place, own in self.members.items():
-                mean = sum(found[column] / self.counts[column] for column in own)
-                self.values[place] = self.terms[place].scale * mean
+    def finish(self, sums: Sequence[float]) -> list[float]:
+        """Values of the terms, from the kernel's sums."""
+        for place, own in self.form.members.items():
+            mean = sum(sums[column] / self.form.counts[column] for column in own)
+            self.values[place] = self.terms[place].scale * mean
         return self.values
 
 
@@ -93,29 +121,16 @@ def _plan(
     p: Tensor, g: Tensor, m: Tensor, v: Tensor, s: Moments, decay: float, terms: Sequence[LocalTerm]
 ) -> _Plan:
     """One step of the kernel; odd terms are added to the gradient at once."""
-    axes: tuple[int, ...] = next(
-        (_axes(term) for term in terms if layout(p.shape, _axes(term)) and _axes(term)), ()
-    )
-    shape = layout(p.shape, axes)
-    assert shape is not None
-    # Of slabs, rows and nodes, in the order of `axes`: two axes have no rows, one has slabs alone.
-    columns = {0: (), 1: (0,), 2: (0, 2), 3: (0, 1, 2)}[len(axes)]
-    factors = [0.0] * 5
-    factors[4] = decay
+    form = _form(tuple(p.shape), tuple((term.kind, _axes(term)) for term in terms))
+    factors = [0.0] * 4 + [decay]
     values = [0.0] * len(terms)
-    counts = [1.0] * 5
-    counts[3] = counts[4] = p.numel()
-    for column, axis in zip(columns, axes, strict=True):
-        counts[column] = max(1, _pairs(p, axis))
-    members: dict[int, tuple[int, ...]] = {}
-    for place, term in enumerate(terms):
-        if _axes(term) != axes and term.kind == "total_variation":
-            values[place] = _add_plainly(term, g)
-            continue
-        members[place] = columns if term.kind == "total_variation" else (3,) if term.kind == "l1" else (4,)
-        for column in members[place]:
-            factors[column] += term.scale * (1 if term.kind == "l1" else 2) / counts[column]
-    return _Plan(Job(p, g, m, v, s, Terms(*factors)), shape, terms, values, members, counts)
+    for place in form.apart:
+        values[place] = _add_plainly(terms[place], g)
+    for place, columns in form.members.items():
+        term = terms[place]
+        for column in columns:
+            factors[column] += term.scale * (1 if term.kind == "l1" else 2) / form.counts[column]
+    return _Plan(Job(p, g, m, v, s, Terms(*factors)), form, terms, values)
 
 
 class FusedAdam(torch.optim.Optimizer):
@@ -212,7 +227,8 @@ class FusedAdam(torch.optim.Optimizer):
                     f"{term.name or 'term'}: found a parameter {shape} that the optimizer does not hold"
                 )
             by_parameter[id(term.parameter)].append(term)
-        plans: list[_Plan] = []
+        flat: list[_Plan] = []
+        grids: list[_Plan] = []
         found: list[tuple[Sequence[LocalTerm], list[float]]] = []
         for group in self.param_groups:
             for p in group["params"]:
@@ -220,13 +236,12 @@ class FusedAdam(torch.optim.Optimizer):
                 step = self._step_one(p, group, terms)
                 if isinstance(step, list):
                     found.append((terms, step))
-                elif step.job.flat:
-                    plans.append(step)
                 else:
-                    found.append((terms, step.finish(update(step.job, step.shape))))
+                    (flat if step.job.flat else grids).append(step)
         # Together, as most parameters are small.
-        sums = update_flat([plan.job for plan in plans])
-        found += [(plan.terms, plan.finish(some)) for plan, some in zip(plans, sums, strict=True)]
+        sums = update([plan.job for plan in grids], [plan.form.shape for plan in grids])
+        sums += update_flat([plan.job for plan in flat])
+        found += [(plan.terms, plan.finish(some)) for plan, some in zip(grids + flat, sums, strict=True)]
         for those, numbers in found:
             for term, value in zip(those, numbers, strict=True):
                 values[term.name] += value

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,17 +11,17 @@ from torch import Tensor
 
 from backbones.kernels.adam_differences import add_differences
 from backbones.kernels.adam_layout import PIECE, Layout, Moments, Terms
-from backbones.kernels.compiler import float32, inline, int64, integer, kernel, matrix, next_task, vector
+from backbones.kernels.adam_tasks import FLAT, flat_tasks, grid_tasks
+from backbones.kernels.compiler import float32, inline, int64, kernel, matrix, next_task, vector
 from backbones.kernels.simd import LANES, load, one, store, total, wide
 from backbones.kernels.simd_math import divide, flush, magnitude, sign, square_root
 from backbones.kernels.threading import launch
+from backbones.kernels.workspace import room
 
 __all__ = ["Job", "update", "update_flat"]
 
 # Blocks of slabs that may be updated at the same time; fixed, so that sums do not depend on threads.
 _BLOCKS = 16
-# Elements of a task where no term looks at neighbours.
-_FLAT = 1 << 15
 _ZERO, _ONE = np.float32(0), np.float32(1)
 
 
@@ -107,7 +105,7 @@ def _flat(table: Any) -> None:
         )
         s, k = _constants(numbers[job]), _factors(numbers[job])
         skips = k.sign == _ZERO and k.value == _ZERO and s.keep == _ONE
-        end = min(begin + _FLAT, p.shape[0])
+        end = min(begin + FLAT, p.shape[0])
         for first in range(begin, end, PIECE):
             last = min(first + PIECE, end)
             if not (skips and m[first] == _ZERO and _idle(g, m, v, first, last)):
@@ -115,45 +113,66 @@ def _flat(table: Any) -> None:
 
 
 @kernel
-def _grid(table: Any) -> None:
-    """As `_flat`, then the old slabs before and after each block, slabs, rows, nodes, inner, slabs of a
-    block.
+def _edges(table: Any) -> None:
+    """Tasks ``(E, 4)``: job, first element of a block, elements of a slab, place in what
+    is written; the slabs before these blocks, the first of these; then of each job p.
 
-    A task is a block of slabs. A slab is updated as soon as the differences of the next one are known, as these still
-    need its old values; what lies in other blocks was copied beforehand.
+    Copies what a block reads of the blocks beside it, which may be updated before.
     """
-    p, g, m, v = (
-        vector(table, 0, float32),
-        vector(table, 1, float32),
-        vector(table, 2, float32),
-        vector(table, 3, float32),
-    )
-    numbers, sums = vector(table, 4, float32), matrix(table, 5, np.float64)
-    before, after = vector(table, 6, float32), vector(table, 7, float32)
-    slabs, rows, nodes, inner, block = (
-        integer(table, 8),
-        integer(table, 9),
-        integer(table, 10),
-        integer(table, 11),
-        integer(table, 12),
-    )
-    s, k = _constants(numbers), _factors(numbers)
-    slab = rows * nodes * inner
-    blocks = (slabs + block - 1) // block
+    parts, before, after = matrix(table, 0, int64), vector(table, 1, float32), vector(table, 2, float32)
     while True:
         task = next_task(table)
         if task < 0:
             break
-        outer, number = task // blocks, task % blocks
-        first, last = number * block, min((number + 1) * block, slabs)
-        # Of inner boundaries only, so one slab less than there are blocks.
-        edge = (outer * (blocks - 1) + number) * slab
+        p = vector(table, 3 + parts[task, 0], float32)
+        at, slab, to = parts[task, 1], parts[task, 2], parts[task, 3]
+        split = slab - slab % LANES
+        for i in range(0, split, LANES):
+            store(before, to + i, load(p, at - slab + i, wide()))
+            store(after, to + i, load(p, at + i, wide()))
+        for i in range(split, slab):
+            before[to + i] = p[at - slab + i]
+            after[to + i] = p[at + i]
+
+
+@kernel
+def _grid(table: Any) -> None:
+    """Constants ``(jobs, 12)``, shapes ``(jobs, 4)``: slabs, rows, nodes, inner; tasks ``(tasks, 5)``: job, first
+    element of its slabs, first and last slab, place of the edges behind it; sums ``(tasks, 5)``, what `_edges` wrote;
+    then of each job p, g, m, v.
+
+    A task is a block of slabs. A slab is updated as soon as the differences of the next one are known, as these still
+    need its old values; what lies in other blocks was copied beforehand.
+    """
+    numbers, shapes, parts = matrix(table, 0, float32), matrix(table, 1, int64), matrix(table, 2, int64)
+    sums, before, after = matrix(table, 3, np.float64), vector(table, 4, float32), vector(table, 5, float32)
+    while True:
+        task = next_task(table)
+        if task < 0:
+            break
+        job, begin, first, last, edge = (
+            parts[task, 0],
+            parts[task, 1],
+            parts[task, 2],
+            parts[task, 3],
+            parts[task, 4],
+        )
+        place = 6 + 4 * job
+        p, g, m, v = (
+            vector(table, place, float32),
+            vector(table, place + 1, float32),
+            vector(table, place + 2, float32),
+            vector(table, place + 3, float32),
+        )
+        s, k = _constants(numbers[job]), _factors(numbers[job])
+        slabs, rows, nodes, inner = shapes[job, 0], shapes[job, 1], shapes[job, 2], shapes[job, 3]
+        slab = rows * nodes * inner
         for a in range(first, last):
-            at = (outer * slabs + a) * slab
+            at = begin + a * slab
             low, below, high, above = p, at, p, at
             if a > first:
                 below = at - slab
-            elif number > 0:
+            elif a > 0:
                 low, below = before, edge - slab
             if a + 1 < last:
                 above = at + slab
@@ -162,7 +181,7 @@ def _grid(table: Any) -> None:
             add_differences(p, g, low, below, high, above, at, rows, nodes, inner, k, sums[task])
             if a > first:
                 _flat_piece(p, g, m, v, at - slab, at, s, k, sums[task])
-        at = (outer * slabs + last - 1) * slab
+        at = begin + (last - 1) * slab
         _flat_piece(p, g, m, v, at, at + slab, s, k, sums[task])
 
 
@@ -192,47 +211,45 @@ class Job(NamedTuple):
         return [self.p.detach().view(-1), self.g.view(-1), self.m.view(-1), self.v.view(-1)]
 
 
-@functools.lru_cache(maxsize=16)
-def _parts(sizes: tuple[int, ...]) -> tuple[Tensor, tuple[int, ...]]:
-    """``(P, 2)`` int64, number and first element of the parts of tensors, and where those of each begin and end."""
-    parts, ends = [], [0]
-    for number, size in enumerate(sizes):
-        parts += [(number, first) for first in range(0, size, _FLAT)]
-        ends.append(len(parts))
-    return torch.tensor(parts).view(-1, 2), tuple(ends)
+def _numbers(jobs: Sequence[Job]) -> Tensor:
+    return torch.tensor([(*job.moments, *job.terms) for job in jobs], dtype=torch.float32)
 
 
-def update_flat(jobs: Sequence[Job]) -> list[Tensor]:
-    """`update` of several parameters at once; none of them has a term that looks at neighbours."""
-    parts, ends = _parts(tuple(job.p.numel() for job in jobs))
+def _by_job(sums: Tensor, starts: tuple[int, ...]) -> list[list[float]]:
+    """The sums of each job's tasks."""
+    found: list[list[float]] = np.add.reduceat(sums.numpy(), starts, axis=0).tolist()
+    return found
+
+
+def update_flat(jobs: Sequence[Job]) -> list[list[float]]:
+    """`update` of parameters none of which has a term that looks at neighbours."""
+    if not jobs:
+        return []
+    tasks = flat_tasks(tuple(job.p.numel() for job in jobs))
     tensors = [tensor for job in jobs for tensor in job.tensors]
-    numbers = torch.tensor([(*job.moments, *job.terms) for job in jobs], dtype=torch.float32)
-    sums = torch.zeros(len(parts), 5, dtype=torch.float64)
-    launch(_flat, len(parts), numbers, parts, sums, *tensors)
-    return [sums[first:last] for first, last in pairwise(ends)]
+    sums = torch.zeros(len(tasks.parts), 5, dtype=torch.float64)
+    launch(_flat, len(sums), _numbers(jobs), tasks.parts, sums, *tensors)
+    return _by_job(sums, tasks.starts)
 
 
-def update(job: Job, shape: Layout) -> Tensor:
-    """One Adam step on ``p``, in place; adds the local gradients to ``g``, and then clears it.
+def update(jobs: Sequence[Job], shapes: Sequence[Layout]) -> list[list[float]]:
+    """One Adam step on each ``p``, in place; adds the local gradients to ``g``, and then clears it.
 
     Args:
-        job: tensors and constants; a term looks at neighbours.
-        shape: of the tensors, from `layout`.
+        jobs: tensors and constants, one or more; of each a term looks at neighbours.
+        shapes: of their tensors, from `layout`.
 
     Returns:
-        ``(parts, 5)`` float64: of the parameters before the step, the sums of squared forward differences along slabs,
-        rows and nodes, of absolute values and of squares, by parts; 0 for those whose factor in ``terms`` is 0.
+        Of each the sums, over the parameters before the step, of squared forward differences along slabs, rows and
+        nodes, of absolute values and of squares; 0 for those whose factor in ``terms`` is 0.
     """
-    constants = torch.tensor((*job.moments, *job.terms), dtype=torch.float32)
-    tensors = job.tensors
-    block = -(-shape.slabs // _BLOCKS)
-    blocks = -(-shape.slabs // block)
-    slabs = tensors[0].view(shape.outer, shape.slabs, -1)
-    # Copies, also where a slice is contiguous as it is.
-    before, after = (
-        x.clone(memory_format=torch.contiguous_format).view(-1)
-        for x in (slabs[:, block - 1 : (blocks - 1) * block : block], slabs[:, block::block])
-    )
-    sums = torch.zeros(shape.outer * blocks, 5, dtype=torch.float64)
-    launch(_grid, len(sums), *tensors, constants, sums, before, after, *shape[1:], block)
-    return sums
+    if not jobs:
+        return []
+    tasks = grid_tasks(tuple(shapes), _BLOCKS)
+    tensors = [job.tensors for job in jobs]
+    before, after = room("adam edges", 2, tasks.held)
+    launch(_edges, len(tasks.edges), tasks.edges, before, after, *(p for p, _, _, _ in tensors))
+    sums = torch.zeros(len(tasks.parts), 5, dtype=torch.float64)
+    flat = [tensor for four in tensors for tensor in four]
+    launch(_grid, len(sums), _numbers(jobs), tasks.shapes, tasks.parts, sums, before, after, *flat)
+    return _by_job(sums, tasks.starts)

@@ -27,6 +27,7 @@ _ORDER = (
     "vm._density",
     "adam_update._flat",
     "adam_update._grid",
+    "adam_update._edges",
     "vm_gradient._density_backward",
     "sums._thin",
     "sums._measure",

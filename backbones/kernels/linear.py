@@ -175,9 +175,12 @@ def mlp(
         raise InputError(f"rows: found {tuple(rows.shape)}, expected ({x.shape[0]},) beside an offset")
     flat = [tensor for layer in layers for tensor in layer]
     given = [tensor for tensor in (x, offset, *flat) if tensor is not None]
-    low = x.dtype == torch.bfloat16 and product_dtype(precision) == torch.bfloat16
-    if takes_compiled(*given[low:]):
-        result: Tensor = _MLP.apply(product_dtype(precision), rows, offset, x, *flat)  # type: ignore[no-untyped-call]
+    dtype = product_dtype(precision)
+    low = x.dtype == torch.bfloat16 and dtype == torch.bfloat16
+    # One product in float32 has nothing to fuse, and torch's own needs neither chunks nor copies.
+    alone = len(layers) == 1 and dtype == torch.float32
+    if takes_compiled(*given[low:]) and not alone:
+        result: Tensor = _MLP.apply(dtype, rows, offset, x, *flat)  # type: ignore[no-untyped-call]
         return result
     hidden = x.to(layers[0][0].dtype)
     for place, (weight, bias) in enumerate(layers):
