@@ -218,6 +218,8 @@ scenes, so they are not part of the project.
   are smeared into brown stripes, the cabin, the front and the tracks are torn; from behind and above (r_0, r_184) the
   cabin is patched with wrong colours. The chair's legs are eaten away or hang as loose specks beside it, there is a
   white gap between seat and back, and the back's plain side is streaked.
+* lego, `few_tensorf_10k` (r_80, seed 2, 22.1 dB), from low at the side: wheels and body are blotched with black, brown
+  fog hangs below the plate's front and specks behind its rear end, the bucket is mottled.
 * chair, `tensorf` (r_152, 27.3 dB): closed, patterns readable, a little darker than it is. A green patch hangs above
   the chair in views from behind and above (r_0, r_168 to r_192): the rest of a wall right before a training camera.
 * chair, `few_tensorf_10k` (the same view, 25.6 dB): no wall. White wood before the white background can be seen
@@ -232,6 +234,10 @@ scenes, so they are not part of the project.
 * chair, `best` (r_64, 26.0 dB; r_152, 30.1 dB): upright, closed, patterns readable. The ornaments are blurred where
   they sit on thin wood, the shadow side of the legs is hazy, the armrest's cloth has lost its pattern, and seat and
   back are a little too bright all over: their sheen is seen from one direction by one training view.
+* lego and chair, `best` in 1,800 iterations (r_144, 28.8 dB, and r_80, 23.9 dB; r_72, 26.0 dB): upright and closed. The
+  faults of `best`, stronger: the studs in the bucket run together into rows; from low at the side lego's wheels are
+  blurred, holes in its beams are filled, and a faint haze lies below the plate; the armrests have no pattern, and the
+  edges of the white wood have a grey fringe.
 * chair and lego, `best-long` (r_72, 25.8 dB, and r_160, 27.6 dB; r_144, 29.9 dB, and r_72, 26.0 dB): the faults of
   `best`, fainter; on lego the studs on top, one pixel wide, and the line below the ground plate stand out.
 * chair with `fewtensorf8` (r_152: `tensorf` 23.7, `few_tensorf_10k` 21.7, `best` 25.9 dB): from the front, where those
