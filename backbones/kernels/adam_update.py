@@ -69,6 +69,17 @@ def _factors(x: Any) -> Terms:
 
 
 @inline
+def _tensors(table: Any, place: int) -> tuple[Any, Any, Any, Any]:
+    """p, g, m, v."""
+    return (
+        vector(table, place, float32),
+        vector(table, place + 1, float32),
+        vector(table, place + 2, float32),
+        vector(table, place + 3, float32),
+    )
+
+
+@inline
 def _flat_piece(p: Any, g: Any, m: Any, v: Any, begin: int, end: int, s: Any, k: Any, sums: Any) -> None:
     """`_flat_step` for some elements, added to the sums of ``|p|`` and ``p^2``."""
     for first in range(begin, end, PIECE):
@@ -96,13 +107,7 @@ def _flat(table: Any) -> None:
         if task < 0:
             break
         job, begin = parts[task, 0], parts[task, 1]
-        place = 3 + 4 * job
-        p, g, m, v = (
-            vector(table, place, float32),
-            vector(table, place + 1, float32),
-            vector(table, place + 2, float32),
-            vector(table, place + 3, float32),
-        )
+        p, g, m, v = _tensors(table, 3 + 4 * job)
         s, k = _constants(numbers[job]), _factors(numbers[job])
         skips = k.sign == _ZERO and k.value == _ZERO and s.keep == _ONE
         end = min(begin + FLAT, p.shape[0])
@@ -114,8 +119,8 @@ def _flat(table: Any) -> None:
 
 @kernel
 def _edges(table: Any) -> None:
-    """Tasks ``(E, 4)``: job, first element of a block, elements of a slab, place in what
-    is written; the slabs before these blocks, the first of these; then of each job p.
+    """Tasks ``(E, 4)``: job, first element of a block, elements of a slab, place in what is written; the slabs before
+    these blocks, the first of these; then of each job p.
 
     Copies what a block reads of the blocks beside it, which may be updated before.
     """
@@ -157,13 +162,7 @@ def _grid(table: Any) -> None:
             parts[task, 3],
             parts[task, 4],
         )
-        place = 6 + 4 * job
-        p, g, m, v = (
-            vector(table, place, float32),
-            vector(table, place + 1, float32),
-            vector(table, place + 2, float32),
-            vector(table, place + 3, float32),
-        )
+        p, g, m, v = _tensors(table, 6 + 4 * job)
         s, k = _constants(numbers[job]), _factors(numbers[job])
         slabs, rows, nodes, inner = shapes[job, 0], shapes[job, 1], shapes[job, 2], shapes[job, 3]
         slab = rows * nodes * inner
