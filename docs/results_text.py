@@ -271,4 +271,7 @@ scenes, so they are not part of the project.
   floats beside it. With fixed masks the dots run into each other, stripes of the sleeves can be seen through, the
   speck is larger. `few_tensorf_finetuned` (32.0 dB) has TensoRF's wrong dots, fewer of them, and no fog. `human` has
   every dot; hem and hair are a little soft.
+* subject_a and subject_b, `few_tensorf_finetuned`, seed 1, its worst views (0006, 31.8 dB; 0001, 28.6 dB): the shirt is
+  smeared below the arms and its checks are out of line at the shoulders; the striped back is torn along its middle, the
+  dots below that are wrong, and lilac crumbs hang under the hem. No fog.
 """
