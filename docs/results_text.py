@@ -11,7 +11,9 @@ Every figure on this page is computed from files in `benchmarks/results/`, one f
 `python docs/make_results.py` writes the page from them. Ours are means over the test
 views of the protocol and, where there are several, over seeds; ± and [ ] are 95 % intervals (Student's t) over seeds,
 or over pairs of the same scene and seed. "α" marks rows that use the pictures' alpha to carve the box. A dash is a run
-that has not been made. Runs with one thread ran beside another one on the same two cores.
+that has not been made. Runs with one thread ran beside another one on the same two cores. Of
+`tensorf` and `few_tensorf_10k` on lego and chair the third seeds ran beside a third program and were halted now and
+then, the clock running on: the times of these rows are upper bounds.
 
 Published figures are those of the Few TensoRF paper, whose rows for TensoRF and FreeNeRF are its own reproductions. Its
 text does not say which eight views it used; its released configuration has those of `fewtensorf8`. Published baselines
