@@ -10,19 +10,19 @@ from torch import Tensor
 
 from backbones.kernels.adam_layout import Layout
 
-__all__ = ["FLAT", "Tasks", "flat_tasks", "grid_tasks"]
+__all__ = ["FLAT", "GridTasks", "flat_tasks", "grid_tasks"]
 
 FLAT = 1 << 15
 """Elements of a task where no term looks at neighbours."""
 
 
-class Tasks(NamedTuple):
-    """Tables that the kernels of `backbones.kernels.adam_update` read, int64.
+class GridTasks(NamedTuple):
+    """Tables that the kernels of `backbones.kernels.adam_update` read for parameters with neighbours, int64.
 
     Args:
         parts: of each task, the part of a parameter that it updates.
         starts: where the tasks of each parameter begin.
-        shapes: of each parameter with neighbours: slabs, rows, nodes, inner.
+        shapes: of each parameter: slabs, rows, nodes, inner.
         edges: of each boundary between two tasks, the slabs to copy.
         held: elements of the slabs before all boundaries.
     """
@@ -35,19 +35,18 @@ class Tasks(NamedTuple):
 
 
 @functools.lru_cache(maxsize=16)
-def flat_tasks(sizes: tuple[int, ...]) -> Tasks:
-    """Of parameters without neighbours, by their numbers of elements."""
+def flat_tasks(sizes: tuple[int, ...]) -> tuple[Tensor, tuple[int, ...]]:
+    """Parts and starts, as of `GridTasks`, of parameters without neighbours, by their numbers of elements."""
     parts: list[tuple[int, int]] = []
     starts = []
     for number, size in enumerate(sizes):
         starts.append(len(parts))
         parts += [(number, first) for first in range(0, size, FLAT)]
-    none = torch.empty(0, dtype=torch.int64)
-    return Tasks(torch.tensor(parts).view(-1, 2), tuple(starts), none, none, 0)
+    return torch.tensor(parts).view(-1, 2), tuple(starts)
 
 
 @functools.lru_cache(maxsize=16)
-def grid_tasks(shapes: tuple[Layout, ...], blocks: int) -> Tasks:
+def grid_tasks(shapes: tuple[Layout, ...], blocks: int) -> GridTasks:
     """Of parameters with neighbours; each is cut into so many blocks of slabs."""
     parts: list[tuple[int, ...]] = []
     edges: list[tuple[int, ...]] = []
@@ -62,7 +61,7 @@ def grid_tasks(shapes: tuple[Layout, ...], blocks: int) -> Tasks:
                     held += slab
                 # The edge behind a block is the next one.
                 parts.append((job, begin, first, min(first + block, slabs), held))
-    return Tasks(
+    return GridTasks(
         torch.tensor(parts).view(-1, 5),
         tuple(starts),
         torch.tensor([shape[1:] for shape in shapes]).view(-1, 4),

@@ -224,11 +224,11 @@ def update_flat(jobs: Sequence[Job]) -> list[list[float]]:
     """`update` of parameters none of which has a term that looks at neighbours."""
     if not jobs:
         return []
-    tasks = flat_tasks(tuple(job.p.numel() for job in jobs))
+    parts, starts = flat_tasks(tuple(job.p.numel() for job in jobs))
     tensors = [tensor for job in jobs for tensor in job.tensors]
-    sums = torch.zeros(len(tasks.parts), 5, dtype=torch.float64)
-    launch(_flat, len(sums), _numbers(jobs), tasks.parts, sums, *tensors)
-    return _by_job(sums, tasks.starts)
+    sums = torch.zeros(len(parts), 5, dtype=torch.float64)
+    launch(_flat, len(sums), _numbers(jobs), parts, sums, *tensors)
+    return _by_job(sums, starts)
 
 
 def update(jobs: Sequence[Job], shapes: Sequence[Layout]) -> list[list[float]]:
