@@ -110,6 +110,17 @@ def test_gradcheck(function: Callable[[RaySamples], Tensor], kept: float) -> Non
     assert gradcheck(of_density, (density,))
 
 
+def test_distortion_reaches_weights_distances_and_lengths() -> None:
+    batch = make_batch(4, 6, 5, kept=0.7, scale=1.0)
+    whole = batch.samples()
+
+    def of_all(weights: Tensor, t: Tensor, delta: Tensor) -> Tensor:
+        return distortion(whole.replace(weights=weights, t=t, delta=delta), near=1.0, far=3.0)
+
+    given = tuple(x.detach().clone().requires_grad_() for x in (whole.weights, whole.t, whole.delta))
+    assert gradcheck(of_all, given)
+
+
 @pytest.mark.parametrize("function", FUNCTIONS)
 def test_rays_without_matter_give_finite_gradients(function: Callable[[RaySamples], Tensor]) -> None:
     density = torch.zeros(12, 3, requires_grad=True)
