@@ -7,6 +7,7 @@ python docs/make_results.py --check    exit with status 1 if one is stale
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import sys
 from collections.abc import Sequence
@@ -20,12 +21,11 @@ from results_runs import (
     STORE,
     STUDY_STORE,
     Runs,
-    minutes,
     psnr,
     records_in,
     ssim,
     table,
-    threads,
+    time_taken,
     with_interval,
     with_spread,
 )
@@ -66,14 +66,11 @@ def few_shot(runs: Runs, protocol: str) -> str:
         for scene in SCENES:
             published = method.published.get(scene)
             seen = runs.mean(scene, protocol, method.run, ssim)
-            taken = runs.mean(scene, protocol, method.run, minutes)
             cells += [
                 with_spread(runs.mean(scene, protocol, method.run, psnr)),
                 "" if published is None else f"{published:.2f}",
                 "–" if seen is None else f"{seen.mean:.3f}",
-                "–"
-                if taken is None
-                else f"{taken.mean:.1f}; {threads(runs.of(scene, protocol, method.run))}",
+                time_taken(runs.of(scene, protocol, method.run)),
             ]
         rows.append(cells)
     return table(head, rows)
@@ -207,13 +204,11 @@ def front_table(runs: Runs, ensemble_store: Path = ENSEMBLE_STORE) -> str:
         cells = []
         for scene in SCENES:
             seen = runs.mean(scene, "dietnerf8", run, ssim)
-            taken = runs.mean(scene, "dietnerf8", run, minutes)
-            if seen is None or taken is None:
+            if seen is None:
                 cells.append("–")
                 continue
             quality = with_spread(runs.mean(scene, "dietnerf8", run, psnr))
-            count = threads(runs.of(scene, "dietnerf8", run))
-            cells.append(f"{quality} / {seen.mean:.3f} / {taken.mean:.1f}; {count}")
+            cells.append(f"{quality} / {seen.mean:.3f} / {time_taken(runs.of(scene, 'dietnerf8', run))}")
         rows.append([f"`{run}`{about}", *cells])
     joined: dict[str, dict[str, dict[str, Any]]] = {}
     for record in records_in(ensemble_store):
@@ -244,13 +239,26 @@ def front_gains(runs: Runs) -> str:
     return table(head, rows)
 
 
+def front_times(store: Path = STUDY_STORE / "speed") -> str:
+    """What README.md shows of whole runs of `best` with nothing beside them: seconds of training, by processor."""
+    found: dict[str, dict[str, float]] = {}
+    for path in sorted(store.glob("schedule-*-best-seed0-2threads*.json")):
+        record = json.loads(path.read_text(encoding="utf-8"))
+        found.setdefault(record["versions"]["cpu"], {})[record["scene"]] = record["seconds"]["train"]
+    rows = [
+        [cpu, *(f"{times[scene]:.0f}" if scene in times else "–" for scene in SCENES)]
+        for cpu, times in sorted(found.items())
+    ]
+    return table(["`best` alone on two cores: training (s)", *SCENES], rows)
+
+
 def with_front(readme: str, runs: Runs) -> str:
     """README.md with its tables renewed, between the marks around them."""
     before, begin, rest = readme.partition(BEGIN)
     _, end, after = rest.partition(END)
     if not begin or not end:
         raise ValueError(f"README.md: found no table between {BEGIN!r} and {END!r}")
-    return f"{before}{begin}\n{front_table(runs)}\n{front_gains(runs)}{end}{after}"
+    return f"{before}{begin}\n{front_table(runs)}\n{front_gains(runs)}\n{front_times()}{end}{after}"
 
 
 def main(words: Sequence[str] | None = None) -> int:

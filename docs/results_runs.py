@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import statistics
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -67,14 +68,13 @@ def ssim(record: dict[str, Any]) -> float:
     return float(record["mean"]["ssim_gaussian"])
 
 
-def minutes(record: dict[str, Any]) -> float:
-    """Of training."""
-    return float(record["seconds"]["train"]) / 60
-
-
-def threads(records: dict[int, dict[str, Any]]) -> str:
-    """How many each run had."""
-    return "/".join(map(str, sorted({record["versions"]["threads"] for record in records.values()})))
+def time_taken(records: dict[int, dict[str, Any]]) -> str:
+    """``7.1; 1/2``: minutes of training, the median of the seeds, and how many threads each had; or a dash."""
+    if not records:
+        return "–"
+    minutes = statistics.median(record["seconds"]["train"] / 60 for record in records.values())
+    threads = "/".join(map(str, sorted({record["versions"]["threads"] for record in records.values()})))
+    return f"{minutes:.1f}; {threads}"
 
 
 def with_spread(found: Estimate | None, digits: int = 2) -> str:

@@ -11,9 +11,10 @@ Every figure on this page is computed from files in `benchmarks/results/`, one f
 `python docs/make_results.py` writes the page from them. Ours are means over the test
 views of the protocol and, where there are several, over seeds; ± and [ ] are 95 % intervals (Student's t) over seeds,
 or over pairs of the same scene and seed. "α" marks rows that use the pictures' alpha to carve the box. A dash is a run
-that has not been made. Runs with one thread ran beside another one on the same two cores. Of
-`tensorf` and `few_tensorf_10k` on lego and chair the third seeds ran beside a third program and were halted now and
-then, the clock running on: the times of these rows are upper bounds.
+that has not been made. Times are medians over seeds, on two kinds of processor (an AMD EPYC and an Intel Xeon, the
+slower one) that others used as well. Runs with one thread ran beside another one on the same two cores; some seeds of
+`tensorf`, `few_tensorf` and `few_tensorf_10k` ran beside a third program or were halted now and then, the clock running
+on, so the times of these rows say no more than how long it takes at most.
 
 Published figures are those of the Few TensoRF paper, whose rows for TensoRF and FreeNeRF are its own reproductions. Its
 text does not say which eight views it used; its released configuration has those of `fewtensorf8`. Published baselines
@@ -210,7 +211,8 @@ scenes, so they are not part of the project.
 * lego, `few_tensorf` (the same view, 26.4 dB): the bucket's inside is blotched, light streaks of fog lie between
   the tracks and before the grille, a white cloud hangs under the front; in low views (r_72, r_80, r_120) a fringe
   of haze hangs below the ground plate, which no training view sees from the side. From behind and above (r_0, r_8,
-  r_192) white specks lie on the ground.
+  r_192) white specks lie on the ground. Seed 1 is alike (r_80, 22.3 dB; r_8, 22.8 dB): black and brown streaks on
+  body and wheels, haze below the plate's front, grey ones behind its rear, white specks behind the bucket's arm.
 * lego, masks as printed (the same view, 26.1 dB): as `few_tensorf`, the bucket's inside as blotched, a light smear in
   the grille. Settings of FourieRF (24.8 dB): pale all over, grainy, a veil above the bucket and before the tracks.
 * lego, `best` (the same view, 29.4 dB): no fog and no haze. What is left: edges one pixel wide, the gaps of the
@@ -227,8 +229,8 @@ scenes, so they are not part of the project.
 * chair, `few_tensorf_10k` (the same view, 25.6 dB): no wall. White wood before the white background can be seen
   through: legs, armrests and the rim below the seat are frayed, most in views from the side (r_64 to r_80, 21.7 to
   22.6 dB). With an occlusion loss that counts 20 samples from the box, the front legs are eaten away as well.
-* chair, `few_tensorf` (r_72, 21.9 dB; r_160, 24.0 dB): the rim below the seat and the edges of the seat are torn into
-  streaks, front legs and armrests are grey and can be seen through; no wall.
+* chair, `few_tensorf` (r_72, 21.9 dB; r_160, 24.0 dB; seed 1: 21.6 and 23.6 dB): the rim below the seat and the edges
+  of the seat are torn into streaks, front legs and armrests are grey and can be seen through; no wall.
 * chair, masks as printed (r_112, 25.0 dB; r_72, 21.9 dB): the seat's green shows through the plain back, the rim below
   the seat hangs in strips, legs and armrests are frayed; no wall. Settings of FourieRF (r_64, 19.8 dB; r_112, 23.6 dB):
   seen from the side of no training view, the white wood is grey, brown and transparent, cloth shows through the back,

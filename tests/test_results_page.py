@@ -157,6 +157,25 @@ def test_the_readme_has_gains_over_tensorf(results: ModuleType, tmp_path: Path) 
     ]
 
 
+def test_the_readme_has_times_by_processor(results: ModuleType, tmp_path: Path) -> None:
+    for name, cpu, scene, seconds in (
+        ("schedule-lego-best-seed0-2threads", "One", "lego", 231.6),
+        ("schedule-chair-best-seed0-2threads", "One", "chair", 197.2),
+        ("schedule-lego-best-seed0-2threads-other", "Other", "lego", 163.4),
+        ("schedule-lego-quick-seed0-2threads", "One", "lego", 50.0),
+    ):
+        record = {"scene": scene, "versions": {"cpu": cpu}, "seconds": {"train": seconds}}
+        (tmp_path / f"{name}.json").write_text(json.dumps(record))
+    assert results.front_times(tmp_path).splitlines()[2:] == ["| One | 232 | 197 |", "| Other | 163 | – |"]
+
+
+def test_times_are_medians_over_seeds(results: ModuleType, tmp_path: Path) -> None:
+    for seed, (seconds, threads) in enumerate([(60.0, 2), (600.0, 1), (90.0, 1)]):
+        store(tmp_path, "best", "lego", seed, 28.0, seconds={"train": seconds}, versions={"threads": threads})
+    text = results.few_shot(results.Runs(tmp_path), "dietnerf8")
+    assert "| `best` | 28.00 ± 0.00 (3) |  | 0.900 | 1.5; 1/2 |" in text
+
+
 def test_paths_are_compared_at_equal_steps_and_seeds(results: ModuleType, tmp_path: Path) -> None:
     assert results.beside_plain(tmp_path) == ""
     plain = ["quality.py", "--steps", "150", "--backend", "torch"]
