@@ -277,6 +277,6 @@ scenes, so they are not part of the project.
   every dot; hem and hair are a little soft.
 * subject_a and subject_b, `few_tensorf_finetuned`, seed 1, its worst views (0006, 31.8 dB; 0001, 28.6 dB): the shirt is
   smeared below the arms and its checks are out of line at the shoulders; the striped back is torn along its middle, the
-  dots below that are wrong, and lilac crumbs hang under the hem. No fog. Seed 2 (0016, 32.2 dB; 0001, 27.7 dB) is alike,
-  with a blue fringe on the trousers.
+  dots below that are wrong, and lilac crumbs hang under the hem. No fog. Seed 2 (0016, 32.2 dB; 0001, 27.7 dB) is
+  alike, with a blue fringe on the trousers.
 """
