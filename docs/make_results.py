@@ -7,7 +7,6 @@ python docs/make_results.py --check    exit with status 1 if one is stale
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import sys
 from collections.abc import Sequence
@@ -242,8 +241,7 @@ def front_gains(runs: Runs) -> str:
 def front_times(store: Path = STUDY_STORE / "speed") -> str:
     """What README.md shows of whole runs of `best` with nothing beside them: seconds of training, by processor."""
     found: dict[str, dict[str, float]] = {}
-    for path in sorted(store.glob("schedule-*-best-seed0-2threads*.json")):
-        record = json.loads(path.read_text(encoding="utf-8"))
+    for record in records_in(store, "schedule-*-best-seed0-2threads*.json"):
         found.setdefault(record["versions"]["cpu"], {})[record["scene"]] = record["seconds"]["train"]
     rows = [
         [cpu, *(f"{times[scene]:.0f}" if scene in times else "–" for scene in SCENES)]

@@ -24,7 +24,7 @@ fine-tuned row. Bodies stand among the claims.
 
 RULE = """A claimed gain *holds* if the interval of our paired differences lies above 0 and reaches the claim; it *holds
 in sign* if it lies above 0 and below the claim; *the opposite* is an interval below 0; one that has 0 inside is *within
-noise*, and *far from the claim* where it does not reach it, unless all pairs have one sign, which two or three of them
+noise*, and *below the claim* where it does not reach it, unless all pairs have one sign, which two or three of them
 may have by chance.
 
 """
@@ -124,7 +124,7 @@ def verdict(gains: Sequence[float], claimed: float) -> str:
         return "the opposite in every pair, too few to be sure"
     if min(gains) > 0:
         return "in sign in every pair, too few to be sure"
-    return "within noise" if found.high >= claimed else "within noise, far from the claim"
+    return "within noise" if found.high >= claimed else "within noise, below the claim"
 
 
 def claims(runs: Runs) -> str:

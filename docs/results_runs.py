@@ -16,9 +16,9 @@ STORE = STUDY_STORE / "quality"
 ENSEMBLE_STORE = STUDY_STORE / "ensembles"
 
 
-def records_in(folder: Path) -> list[dict[str, Any]]:
-    """All stored runs of a folder, in the order of their names."""
-    return [json.loads(path.read_text(encoding="utf-8")) for path in sorted(folder.glob("*.json"))]
+def records_in(folder: Path, pattern: str = "*.json") -> list[dict[str, Any]]:
+    """All stored runs of a folder whose names fit, in the order of these."""
+    return [json.loads(path.read_text(encoding="utf-8")) for path in sorted(folder.glob(pattern))]
 
 
 class Runs:

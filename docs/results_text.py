@@ -230,7 +230,7 @@ scenes, so they are not part of the project.
 * chair, `few_tensorf_10k` (the same view, 25.6 dB): no wall. White wood before the white background can be seen
   through: legs, armrests and the rim below the seat are frayed, most in views from the side (r_64 to r_80, 21.7 to
   22.6 dB). With an occlusion loss that counts 20 samples from the box, the front legs are eaten away as well.
-* chair, `few_tensorf` (r_72, 21.9 dB; r_160, 24.0 dB; in seeds 1 and 2 alike): the rim below the seat and the edges
+* chair, `few_tensorf` (r_72, 21.9 dB, in seeds 1 and 2 alike; r_160, 24.0 dB): the rim below the seat and the edges
   of the seat are torn into streaks, front legs and armrests are grey and can be seen through; no wall.
 * chair, masks as printed (r_112, 25.0 dB; r_72, 21.9 dB): the seat's green shows through the plain back, the rim below
   the seat hangs in strips, legs and armrests are frayed; no wall. Settings of FourieRF (r_64, 19.8 dB; r_112, 23.6 dB):
