@@ -13,6 +13,7 @@ from gridreg.base import Context, Regularizer, check_weight, register
 from gridreg.errors import InputError
 from gridreg.samples import RaySamples
 from gridreg.schedules import Numeric, check_numeric
+from gridreg.segments import before_less_behind
 from gridreg.sites import SiteLike
 
 __all__ = [
@@ -101,10 +102,9 @@ class _Distortion(torch.autograd.Function):
     def forward(
         ctx: Any, weights: Tensor, t: Tensor, delta: Tensor, offsets: Tensor, ray_indices: Tensor
     ) -> Tensor:
-        # The sums run over all rays, and float64 keeps the digits that the earlier ones would use up.
         w, wide = weights.double(), t.double()
-        lead = _before_less_behind(w, offsets, ray_indices)
-        away = (wide * lead).sub_(_before_less_behind(w * wide, offsets, ray_indices))
+        lead = before_less_behind(w, offsets, ray_indices)
+        away = (wide * lead).sub_(before_less_behind(w * wide, offsets, ray_indices))
         within = w * delta
         ctx.save_for_backward(w, lead, away, within)
         return (away.dot(w) + within.dot(w) / 3).to(weights.dtype)
@@ -119,15 +119,6 @@ class _Distortion(torch.autograd.Function):
         of_delta = w.square().mul_(gradient / 3) if wanted[2] else None
         found = (of_weights, of_t, of_delta)
         return (*(x if x is None else x.to(gradient.dtype) for x in found), None, None)
-
-
-def _before_less_behind(values: Tensor, offsets: Tensor, ray_indices: Tensor) -> Tensor:
-    """Sum over the earlier samples of the same ray less the sum over the later ones, ``(N,)``."""
-    running = values.new_zeros(values.shape[0] + 1)
-    torch.cumsum(values, 0, out=running[1:])
-    ends = running.index_select(0, offsets)
-    # Twice the sum up to here, itself included, less itself, less what was before the ray and after it.
-    return (running[1:] + running[:-1]).sub_((ends[:-1] + ends[1:]).index_select(0, ray_indices))
 
 
 def distortion(samples: RaySamples, near: float | None = None, far: float | None = None) -> Tensor:

@@ -7,7 +7,18 @@ from typing import Any
 import torch
 from torch import Tensor
 
-__all__ = ["optical_depth_to_weights", "spread", "sum_before", "sum_per_ray"]
+__all__ = ["before_less_behind", "optical_depth_to_weights", "spread", "sum_before", "sum_per_ray"]
+
+
+def _running(values: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
+    """The sum over all rays before each sample, and after the last, ``(N + 1,)``; the same where rays begin and end.
+
+    In float32 the differences between these would lose the digits that the earlier rays have used up; float64 keeps
+    them.
+    """
+    running = values.new_zeros(values.shape[0] + 1, dtype=torch.float64)
+    torch.cumsum(values, 0, dtype=torch.float64, out=running[1:])
+    return running, running.index_select(0, offsets)
 
 
 class _SumPerRay(torch.autograd.Function):
@@ -44,13 +55,8 @@ class _SumBefore(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, values: Tensor, offsets: Tensor, ray_indices: Tensor) -> Tensor:
         ctx.save_for_backward(offsets, ray_indices)
-        # One running sum over all rays, less its value where the ray begins. In float32 the difference would
-        # lose the digits that the earlier rays have used up; float64 keeps them.
-        wide = values.double()
-        before = wide.cumsum(0) - wide
-        last = max(before.shape[0] - 1, 0)
-        begin = before.index_select(0, offsets[:-1].clamp(max=last)) if before.shape[0] else before
-        return (before - begin.index_select(0, ray_indices)).to(values.dtype)
+        running, ends = _running(values, offsets)
+        return (running[:-1] - ends[:-1].index_select(0, ray_indices)).to(values.dtype)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:
@@ -84,6 +90,13 @@ def sum_before(values: Tensor, offsets: Tensor, ray_indices: Tensor) -> Tensor:
     """Add over the earlier samples of the same ray (exclusive prefix sum): ``(N,)`` to ``(N,)``."""
     result: Tensor = _SumBefore.apply(values, offsets, ray_indices)  # type: ignore[no-untyped-call]
     return result
+
+
+def before_less_behind(values: Tensor, offsets: Tensor, ray_indices: Tensor) -> Tensor:
+    """Add over the earlier samples of the same ray and subtract the later ones: ``(N,)`` in float64; no gradient."""
+    running, ends = _running(values, offsets)
+    # Twice the sum up to here, itself included, less itself, less what was before the ray and after it.
+    return (running[1:] + running[:-1]).sub_((ends[:-1] + ends[1:]).index_select(0, ray_indices))
 
 
 def optical_depth_to_weights(optical_depth: Tensor, offsets: Tensor) -> Tensor:
