@@ -19,6 +19,8 @@ class TrainSettings:
     Args:
         steps: iterations.
         rays: per iteration.
+        patches, patch_size: further rays per iteration where a regularizer needs them (`DepthSmoothness`, `RayKL`): so
+            many square patches of so many rays along each edge, from cameras between the training cameras.
         learning_rate_grid, learning_rate_network: Adam's, at the start (betas 0.9 and 0.99).
         learning_rate_decay: factor over the whole run, exponential in the iteration.
         reset_learning_rate: start the decay again at every resampling, as TensoRF does.
@@ -46,6 +48,8 @@ class TrainSettings:
 
     steps: int = 15_000
     rays: int = 1024
+    patches: int = 1
+    patch_size: int = 8
     learning_rate_grid: float = 0.02
     learning_rate_network: float = 1e-3
     learning_rate_decay: float = 0.1
@@ -70,10 +74,12 @@ class TrainSettings:
     evaluate_at: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
-        for name in ("steps", "rays", "voxels_start", "voxels_end", "occupancy_resolution"):
+        for name in ("steps", "rays", "patches", "voxels_start", "voxels_end", "occupancy_resolution"):
             value = getattr(self, name)
             if value < 1:
                 raise InputError(f"train.{name}: found {value}, expected an integer of at least 1")
+        if self.patch_size < 2:
+            raise InputError(f"train.patch_size: found {self.patch_size}, expected an integer of at least 2")
         for name in ("learning_rate_grid", "learning_rate_network", "learning_rate_decay", "step_ratio"):
             value = getattr(self, name)
             if not (value > 0 and math.isfinite(value)):

@@ -15,12 +15,13 @@ from torch import Tensor, nn
 import gridreg
 from gridreg.base import Regularizer
 from gridreg.errors import InputError
-from gridreg.rendering import March, OccupancyGrid, Rendered, render_rays
+from gridreg.rendering import March, OccupancyGrid, Rays, Rendered, render_rays
 from gridreg.scenes import Scene
 from gridreg.training import events
 from gridreg.training.averaging import WeightAverage
 from gridreg.training.rays import RayBank, warp_of
 from gridreg.training.settings import TrainSettings
+from gridreg.training.unseen import UnseenPatches
 
 __all__ = ["StepReport", "Trainer"]
 
@@ -58,6 +59,9 @@ class Trainer:
         self.handle = gridreg.apply(field, *composition, total_steps=settings.steps, seed=seed)
         self.warp = warp_of(scene)
         self.bank = RayBank(scene.train, self.warp)
+        self.unseen: UnseenPatches | None = None
+        if any("patch" in regularizer.needs() for regularizer in composition):
+            self.unseen = UnseenPatches(scene.train, settings.patch_size, self.warp)
         self.step = 0
         self.occupancy = OccupancyGrid.full(field.bounds, events.occupancy_resolution(field, settings))
         self._restart_at = 0
@@ -118,19 +122,29 @@ class Trainer:
                 self.average.give(self.field.parameters())
 
     def render_batch(self) -> tuple[Rendered, Tensor]:
-        """Draw rays, render them, and composite their targets on the same background ``(R, 3)``.
+        """Draw rays, render them, and composite the targets of the first ones on the same background ``(R, 3)``.
 
-        The samples know the opacity of their targets, but for opaque pictures on a backdrop, which tell nothing of it.
+        Rays of unseen patches, where a regularizer needs them, come last and have no targets. The samples know the
+        opacity of their targets, but for these and for opaque pictures on a backdrop, which tell nothing of it.
         """
-        rays, rgba = self.bank.draw(self.settings.rays, self.generator)
+        settings = self.settings
+        rays, rgba = self.bank.draw(settings.rays, self.generator)
+        seen, patch = len(rays), None
+        if self.unseen is not None:
+            more = self.unseen.draw(settings.patches, self.generator)
+            rays = Rays(
+                torch.cat([rays.origins, more.origins]), torch.cat([rays.directions, more.directions])
+            )
+            patch = (settings.patches, settings.patch_size, settings.patch_size)
         jitter = torch.rand(len(rays), generator=self.generator)
         default = self.scene.background.to(rgba)
         background, opacity = None, torch.full_like(jitter, math.nan)
         # Behind opaque pictures on one colour, random ones would be answered with walls of that colour.
         if self.scene.train.backdrop is None:
-            background, opacity = self.handle.background(len(rays), self.generator, default), rgba[:, 3]
+            background = self.handle.background(len(rays), self.generator, default)
+            opacity[:seen] = rgba[:, 3]
         background = (default if background is None else background).expand(len(rays), 3)
-        target = rgba[:, :3] * rgba[:, 3:] + (1 - rgba[:, 3:]) * background
+        target = rgba[:, :3] * rgba[:, 3:] + (1 - rgba[:, 3:]) * background[:seen]
         march = self.march
         ones = torch.ones_like(jitter)
         rendered = render_rays(
@@ -145,7 +159,9 @@ class Trainer:
             generator=self.generator,
         )
         assert rendered.samples is not None
-        return replace(rendered, samples=rendered.samples.replace(target_opacity=opacity)), target
+        return replace(
+            rendered, samples=rendered.samples.replace(target_opacity=opacity, patch=patch)
+        ), target
 
     def train_step(self) -> StepReport:
         """One iteration.
@@ -156,7 +172,7 @@ class Trainer:
         self.handle.step(self.step)
         self._set_learning_rates()
         rendered, target = self.render_batch()
-        mse = (rendered.colour - target).square().mean()
+        mse = (rendered.colour[: len(target)] - target).square().mean()
         folded = self.handle.grid_terms() if getattr(self.optimizer, "accepts_local_terms", False) else []
         loss = mse + self.handle.loss(rendered.samples, exclude={term.name for term in folded})
         value = loss.item()
