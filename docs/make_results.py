@@ -240,13 +240,14 @@ def front_gains(runs: Runs) -> str:
 
 def front_times(store: Path = STUDY_STORE / "speed") -> str:
     """What README.md shows of whole runs of `best` with nothing beside them: seconds of training, by processor."""
-    found: dict[str, dict[str, float]] = {}
+    found: dict[str, dict[str, str]] = {}
     for record in records_in(store, "schedule-*-best-seed0-2threads*.json"):
-        found.setdefault(record["versions"]["cpu"], {})[record["scene"]] = record["seconds"]["train"]
-    rows = [
-        [cpu, *(f"{times[scene]:.0f}" if scene in times else "–" for scene in SCENES)]
-        for cpu, times in sorted(found.items())
-    ]
+        stolen = record.get("stolen")
+        share = "" if stolen is None else f", {stolen:.0%} stolen"
+        found.setdefault(record["versions"]["cpu"], {})[record["scene"]] = (
+            f"{record['seconds']['train']:.0f}{share}"
+        )
+    rows = [[cpu, *(times.get(scene, "–") for scene in SCENES)] for cpu, times in sorted(found.items())]
     return table(["`best` alone on two cores: training (s)", *SCENES], rows)
 
 

@@ -166,8 +166,11 @@ def test_the_readme_has_times_by_processor(results: ModuleType, tmp_path: Path) 
         ("schedule-lego-quick-seed0-2threads", "One", "lego", 50.0),
     ):
         record = {"scene": scene, "versions": {"cpu": cpu}, "seconds": {"train": seconds}}
+        if cpu == "Other":
+            record["stolen"] = 0.281
         (tmp_path / f"{name}.json").write_text(json.dumps(record))
-    assert results.front_times(tmp_path).splitlines()[2:] == ["| One | 232 | 197 |", "| Other | 163 | – |"]
+    rows = results.front_times(tmp_path).splitlines()[2:]
+    assert rows == ["| One | 232 | 197 |", "| Other | 163, 28% stolen | – |"]
 
 
 def test_times_are_medians_over_seeds(results: ModuleType, tmp_path: Path) -> None:

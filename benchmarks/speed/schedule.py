@@ -44,9 +44,13 @@ def show(record: Record) -> str:
         )
     table = common.markdown(["iterations", "grid", "seconds", "per iteration (ms)", "peak so far (MB)"], rows)
     views = record["test_views"]
+    stolen = record.get("stolen")
+    taken = (
+        "" if stolen is None else f"; {stolen:.0%} of the processors' time went to other guests of the host"
+    )
     return (
         f"{record['scene']}, {record['protocol']}, {record['preset']}, {record['steps']} iterations, "
         f"seed {record['seed']}, {record['arguments']['backend']} path: {seconds['train']:.1f} s of training, "
         f"PSNR {record['mean']['psnr']:.2f} dB on {views} test views in {seconds['test']:.1f} s, "
-        f"peak memory {max(peaks.values()) / 1e6:.0f} MB.\n\n{table}"
+        f"peak memory {max(peaks.values()) / 1e6:.0f} MB{taken}.\n\n{table}"
     )

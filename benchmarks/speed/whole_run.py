@@ -45,6 +45,34 @@ def peak_bytes(status: Path = Path("/proc/self/status")) -> int:
     return most if sys.platform == "darwin" else 1024 * most
 
 
+class Stolen:
+    """The share of all processors' time that the host of a virtual machine gives to others, from now on.
+
+    Seconds of a program that ran meanwhile are too long by about that share.
+    """
+
+    def __init__(self, stat: Path = Path("/proc/stat")) -> None:
+        self.stat = stat
+        self.began = self._ticks()
+
+    def _ticks(self) -> tuple[int, int] | None:
+        """Ticks in all, and those stolen; None where the system does not count them."""
+        try:
+            words = self.stat.read_text().split("\n", 1)[0].split()
+            # user, nice, system, idle, iowait, irq, softirq, steal; guests' are within user's.
+            ticks = [int(word) for word in words[1:9]]
+        except (OSError, ValueError):
+            return None
+        return (sum(ticks), ticks[7]) if words[:1] == ["cpu"] and len(ticks) == 8 else None
+
+    def share(self) -> float | None:
+        """In [0, 1]; None where it is not known."""
+        ended = self._ticks()
+        if self.began is None or ended is None or ended[0] <= self.began[0]:
+            return None
+        return (ended[1] - self.began[1]) / (ended[0] - self.began[0])
+
+
 def boundaries(settings: TrainSettings) -> list[int]:
     """Iterations at which the schedule changes the grid, its cells or its rays, and both ends."""
     inside = {*settings.resample_at, *settings.occupancy_at, *settings.shrink_at, *settings.filter_rays_at}
@@ -57,9 +85,11 @@ class Spans:
     def __init__(self, settings: TrainSettings) -> None:
         self.ends = boundaries(settings)[1:]
         self.rows: list[Record] = []
+        self.stolen_share: float | None = None
 
     def start(self, run: Execution) -> None:
         self.run, self.began, self.first = run, time.perf_counter(), run.trainer.step
+        self.stolen = Stolen()
         self.resolution = list(getattr(run.trainer.field, "resolution", ()))
 
     def step(self, report: StepReport) -> None:
@@ -77,6 +107,7 @@ class Spans:
             }
         )
         self.first, self.began = step, now
+        self.stolen_share = self.stolen.share()
         # The events of this iteration have been, so this is the grid of the next span.
         self.resolution = list(getattr(self.run.trainer.field, "resolution", ()))
 
@@ -122,6 +153,7 @@ def run_here(arguments: argparse.Namespace) -> Record:
         "seed": metrics["seed"],
         "mean": metrics["mean"],
         "seconds": metrics["seconds"],
+        "stolen": spans.stolen_share,
         "test_views": len(metrics["images"]),
         "spans": spans.rows,
         "peak_bytes": peaks,
