@@ -37,6 +37,7 @@ def run(**changes):
         replace(run(), preset="mine", config={**CONFIG, "preset": "mine"}),
         replace(run(), config={**CONFIG, "train": {"steps": 100, "checkpoint_minutes": 9.0}}),
         replace(run(), config=dict(reversed(CONFIG.items()))),
+        replace(run(), config={**CONFIG, "train": {**CONFIG["train"], "reshuffle": False, "patches": 1}}),
     ],
 )
 def test_what_changes_nothing_is_not_in_the_hash(other):
@@ -56,6 +57,8 @@ def test_what_changes_nothing_is_not_in_the_hash(other):
         replace(run(), test=()),
         replace(run(), config={**CONFIG, "composition": [{"name": "L1", "weight": 2e-4}]}),
         replace(run(), config={**CONFIG, "train": {"steps": 101, "checkpoint_minutes": 2.0}}),
+        replace(run(), config={**CONFIG, "train": {**CONFIG["train"], "reshuffle": True}}),
+        replace(run(), config={**CONFIG, "train": {**CONFIG["train"], "patches": 2}}),
     ],
 )
 def test_what_determines_the_result_is_in_the_hash(other):

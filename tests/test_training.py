@@ -79,8 +79,12 @@ def test_the_same_seed_gives_the_same_numbers(scene, config):
     assert not torch.equal(other.field.density_lines[0], one.field.density_lines[0])
 
 
-@pytest.mark.parametrize("stop", [1, 8, 9, 13, 20, 29])
-def test_a_resumed_run_ends_bit_for_bit_like_an_uninterrupted_one(scene, config, stop, tmp_path):
+@pytest.mark.parametrize(
+    ("stop", "reshuffle"),
+    [(1, False), (8, False), (9, True), (13, False), (17, True), (20, True), (29, False)],
+)
+def test_a_resumed_run_ends_bit_for_bit_like_an_uninterrupted_one(scene, config, stop, reshuffle, tmp_path):
+    config = replace(config, train=replace(config.train, reshuffle=reshuffle))
     whole = build_trainer(config, scene)
     whole.train()
     out = tmp_path / "run"
@@ -291,3 +295,24 @@ def test_the_example_answers_bad_input_with_one_line_and_status_2(arguments, mes
     assert message in done.stderr
     assert "Traceback" not in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_pixels_in_a_random_order_each_once_before_any_again(scene):
+    bank, generator = RayBank(scene.train, reshuffle=True), torch.Generator().manual_seed(0)
+    few = torch.arange(0, len(bank.pixels), 7)
+    bank.restrict(lambda rays: torch.zeros(len(rays), dtype=torch.bool))
+    bank.active = few
+    bank.pixels = torch.arange(len(bank.pixels), dtype=torch.float32)[:, None].expand(-1, 4)
+    drawn = torch.cat([bank.draw(100, generator)[1][:, 0] for _ in range(40)]).long()
+    rounds = drawn[: len(drawn) // len(few) * len(few)].reshape(-1, len(few))
+    assert len(rounds) >= 2
+    assert torch.equal(rounds.sort(dim=1).values, few.expand(len(rounds), -1))
+    assert not torch.equal(rounds[0], rounds[1])
+    assert not torch.equal(rounds[0], few)
+
+
+def test_no_pixel_waits_that_is_not_drawn_any_more(scene):
+    bank, generator = RayBank(scene.train, reshuffle=True), torch.Generator().manual_seed(0)
+    bank.draw(10, generator)
+    bank.restrict(lambda rays: torch.zeros(len(rays), dtype=torch.bool))
+    assert (bank.draw(len(bank.active), generator)[1][:, 3] > 0).all()

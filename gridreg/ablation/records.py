@@ -21,6 +21,9 @@ STATUSES: tuple[Status, ...] = ("waiting", "running", "done", "failed")
 
 _BUILTIN = "builtin"
 
+# Settings that came later, with the values that leave a run as it was before them.
+_LATER = {"patches": 1, "patch_size": 8, "reshuffle": False}
+
 
 @dataclass(frozen=True)
 class RunSpec:
@@ -67,11 +70,16 @@ class RunSpec:
 
         The scene goes in by its name, because it may lie elsewhere on another machine; the store compares the
         fingerprints of what was trained on. Names of row and preset, and how often a checkpoint is written, stay
-        out: they change nothing. So does the number of threads, which is recorded with the result.
+        out: they change nothing. So does the number of threads, which is recorded with the result, and settings that
+        did not exist when stores were first written, at the values that leave a run as it was.
         """
         config = {key: value for key, value in self.config.items() if key not in ("scene", "preset")}
         if isinstance(config.get("train"), dict):
-            config["train"] = {k: v for k, v in config["train"].items() if k != "checkpoint_minutes"}
+            config["train"] = {
+                key: value
+                for key, value in config["train"].items()
+                if key != "checkpoint_minutes" and (key not in _LATER or value != _LATER[key])
+            }
         content = {
             "numerics": NUMERICS_VERSION,
             "scene": self.scene_name,

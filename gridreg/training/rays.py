@@ -56,13 +56,15 @@ class RayBank:
     Args:
         views: ``V`` pictures of ``H x W``.
         warp: maps their rays to the field's coordinates; None: these are the world's.
+        reshuffle: draw every active pixel once before any is drawn again, instead of with replacement.
     """
 
-    def __init__(self, views: Views, warp: NdcWarp | None = None) -> None:
-        self.views, self.warp = views, warp
+    def __init__(self, views: Views, warp: NdcWarp | None = None, *, reshuffle: bool = False) -> None:
+        self.views, self.warp, self.reshuffle = views, warp, reshuffle
         self.count, self.height, self.width = views.rgba.shape[:3]
         self.pixels = views.rgba.reshape(-1, 4)
         self.active = torch.arange(self.pixels.shape[0], device=self.pixels.device)
+        self.waiting = self.active[:0]
 
     def rays(self, index: Tensor) -> Rays:
         """Rays through pixels given by flat index ``(R,)``."""
@@ -74,16 +76,30 @@ class RayBank:
         return rays if self.warp is None else self.warp(rays)
 
     def draw(self, count: int, generator: torch.Generator) -> tuple[Rays, Tensor]:
-        """``count`` random rays among the active ones and their RGBA ``(R, 4)``, with replacement."""
-        chosen = torch.randint(self.active.shape[0], (count,), generator=generator, device=self.active.device)
-        index = self.active[chosen]
+        """``count`` random rays among the active ones and their RGBA ``(R, 4)``."""
+        if self.reshuffle:
+            index = self._next(count, generator)
+        else:
+            chosen = torch.randint(
+                self.active.shape[0], (count,), generator=generator, device=self.active.device
+            )
+            index = self.active[chosen]
         return self.rays(index), self.pixels[index]
+
+    def _next(self, count: int, generator: torch.Generator) -> Tensor:
+        """The next pixels in a random order, and then of other random orders."""
+        while len(self.waiting) < count:
+            order = torch.randperm(self.active.shape[0], generator=generator, device=self.active.device)
+            self.waiting = torch.cat([self.waiting, self.active[order]])
+        chosen, self.waiting = self.waiting[:count], self.waiting[count:]
+        return chosen
 
     def restrict(self, useful: Callable[[Rays], Tensor], chunk: int = 1 << 15) -> None:
         """Keep the active pixels whose ray is useful, and all that are not transparent."""
         parts = torch.split(self.active, chunk)
         kept = [part[useful(self.rays(part)) | (self.pixels[part, 3] > 0)] for part in parts]
         self.active = torch.cat(kept)
+        self.waiting = self.active[:0]
 
 
 def meets(rays: Rays, occupancy: OccupancyGrid, near: float, far: float) -> Tensor:

@@ -19,6 +19,8 @@ class TrainSettings:
     Args:
         steps: iterations.
         rays: per iteration.
+        reshuffle: draw every pixel once before any is drawn again, in an order that is new each time; False: with
+            replacement.
         patches, patch_size: further rays per iteration where a regularizer needs them (`DepthSmoothness`, `RayKL`): so
             many square patches of so many rays along each edge, from cameras between the training cameras.
         learning_rate_grid, learning_rate_network: Adam's, at the start (betas 0.9 and 0.99).
@@ -48,6 +50,7 @@ class TrainSettings:
 
     steps: int = 15_000
     rays: int = 1024
+    reshuffle: bool = False
     patches: int = 1
     patch_size: int = 8
     learning_rate_grid: float = 0.02

@@ -58,7 +58,7 @@ class Trainer:
         self.generator = torch.Generator().manual_seed(seed)
         self.handle = gridreg.apply(field, *composition, total_steps=settings.steps, seed=seed)
         self.warp = warp_of(scene)
-        self.bank = RayBank(scene.train, self.warp)
+        self.bank = RayBank(scene.train, self.warp, reshuffle=settings.reshuffle)
         self.unseen: UnseenPatches | None = None
         if any("patch" in regularizer.needs() for regularizer in composition):
             self.unseen = UnseenPatches(scene.train, settings.patch_size, self.warp)
@@ -222,6 +222,7 @@ class Trainer:
                 "hull": self.occupancy.hull,
             },
             "active": self.bank.active,
+            "waiting": self.bank.waiting.clone(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -236,6 +237,7 @@ class Trainer:
             self.average.load_state_dict(state["average"])
         self.occupancy = OccupancyGrid(**state["occupancy"])
         self.bank.active = state["active"]
+        self.bank.waiting = state.get("waiting", self.bank.active[:0])
 
 
 def load_field(field: nn.Module, state: dict[str, Any], handle: Any = None) -> None:
