@@ -22,6 +22,11 @@ scatter by 1 to 2 dB between papers, so only rows of one program under one proto
 fine-tuned row has FreeNeRF's range from the near plane, that of the raw one counts samples from the box.
 `few_tensorf_finetuned` is the fine-tuned row with what helped it on validation views; it is no part of the paper.
 
+All runs but those of `best` and `best-long` draw pixels with replacement, where TensoRF's own program draws each once
+before any again (`train.reshuffle`); for `best` that was worth 0.1 to 0.2 dB. It is the same for all others, so what
+separates them is something else. `best` had 3,000 iterations of 1,024 rays and drew with replacement when most of its
+studies were made, which set that; the first two of them are about the change.
+
 """
 
 
@@ -46,7 +51,6 @@ METHODS = (
     Method("in the style of SANeRF, 2,500 iterations as in its program", "sanerf --steps 2500", {}),
     Method("`quick`", "quick", {}),
     Method("`best`", "best", {}),
-    Method("`best` in 1,800 iterations", "best --steps 1800", {}),
     Method("`best-long`", "best-long", {}),
 )
 BODIES = ("subject_a", "subject_b")
@@ -60,9 +64,8 @@ BODY_METHODS = (
 )
 
 FRONT = (
-    ("best", ", 3,000 iterations"),
-    ("best --steps 1800", ""),
-    ("best-long", ", 12,000 iterations"),
+    ("best", ", 1,600 iterations of 1,536 rays"),
+    ("best-long", ", 6,400 iterations of 1,536 rays"),
     ("quick", ", 1,200 iterations, 200^3"),
     ("tensorf", ", 15,000 iterations"),
     ("few_tensorf_finetuned", ", 10,000 iterations"),
@@ -108,6 +111,20 @@ STUDIES = (
         "most, in the published row as well, likely because Adam gives it its full step while colours have no gradient "
         "yet, which draws the lines to zero. With random backgrounds and a hull to begin from, stronger total "
         "variation and faster learning cost as well, and masks may open early or late.",
+    ),
+    (
+        "best_draws",
+        "Which pixels `best` draws",
+        "Any at any time, as it was, or every one once before any comes again, as TensoRF's program does and `best` does "
+        "now: eight small pictures are some eight rounds of drawing, in which chance leaves many pixels out for long.",
+    ),
+    (
+        "best_shorter",
+        "`best` in fewer iterations, with more rays in each",
+        "Every pixel drawn once before any comes again. A good part of an iteration does not depend on its rays (Adam on "
+        "the grids, small operations), so half as many rays again cost about a quarter more time. 1,800 iterations of "
+        "1,536 rays take as long as 2,300 of 1,024, and are ahead on both scenes; twice as many rays in each gain "
+        "nothing more. `best` is the last row, which leaves three minutes some room on the slower processor.",
     ),
     (
         "best_leave_one_out",
@@ -165,6 +182,17 @@ STUDIES = (
         "Components of `best` at its full length",
         "Half of those of appearance. After 1,000 iterations they were not missed; at full length both scenes lose, so "
         "they stay.",
+    ),
+    (
+        "best_faster",
+        "What would make `best` faster",
+        "Narrower hidden layers, or steps of 1.5 cells along the ray, save time and cost lego, where thin parts count, "
+        "more than fewer iterations do.",
+    ),
+    (
+        "best_unseen",
+        "Views without a picture",
+        "UNSEEN",
     ),
     (
         "best_cells",
