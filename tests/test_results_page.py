@@ -131,7 +131,7 @@ def test_the_readme_has_the_same_figures(results: ModuleType, tmp_path: Path) ->
     store(runs, "best", "chair", 0, 30.0)
     store(joined, "best", "chair", 0, 30.5, members=[{}, {}])
     text = results.front_table(results.Runs(runs), joined)
-    assert "| `best`, 3,000 iterations | – | 30.00 (1) / 0.900 / 2.0; 2 |" in text
+    assert "| `best`, 1,600 iterations of 1,536 rays | – | 30.00 (1) / 0.900 / 2.0; 2 |" in text
     assert "| `tensorf`, 15,000 iterations | – | – |" in text
     assert text.endswith("| 2 seeds of `best` joined | – | 30.50 / 0.900 |\n")
     told = f"Before.\n{results.BEGIN}\nold\n{results.END}\nAfter.\n"
@@ -162,6 +162,7 @@ def test_the_readme_has_times_by_processor(results: ModuleType, tmp_path: Path) 
     for name, cpu, scene, seconds in (
         ("schedule-lego-best-seed0-2threads", "One", "lego", 231.6),
         ("schedule-chair-best-seed0-2threads", "One", "chair", 197.2),
+        ("schedule-lego-best-seed0-2threads-again", "One", "lego", 90.0),
         ("schedule-lego-best-seed0-2threads-other", "Other", "lego", 163.4),
         ("schedule-lego-quick-seed0-2threads", "One", "lego", 50.0),
     ):
@@ -170,7 +171,7 @@ def test_the_readme_has_times_by_processor(results: ModuleType, tmp_path: Path) 
             record["stolen"] = 0.281
         (tmp_path / f"{name}.json").write_text(json.dumps(record))
     rows = results.front_times(tmp_path).splitlines()[2:]
-    assert rows == ["| One | 232 | 197 |", "| Other | 163, 28% stolen | – |"]
+    assert rows == ["| One | 90; 232 | 197 |", "| Other | 163 (28% stolen) | – |"]
 
 
 def test_times_are_medians_over_seeds(results: ModuleType, tmp_path: Path) -> None:
