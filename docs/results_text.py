@@ -186,8 +186,8 @@ STUDIES = (
     (
         "best_faster",
         "What would make `best` faster",
-        "Steps of 1.5 cells along the ray lose on both scenes. Narrower hidden layers save a fifth of the time and lose "
-        "on lego; fewer iterations of more rays save more, and lose less.",
+        "Steps of 1.5 cells along the ray lose on both scenes. Narrower hidden layers save a fifth of the time and "
+        "lose on lego; fewer iterations of more rays save more, and lose less.",
     ),
     (
         "best_cells",
