@@ -316,3 +316,11 @@ def test_no_pixel_waits_that_is_not_drawn_any_more(scene):
     bank.draw(10, generator)
     bank.restrict(lambda rays: torch.zeros(len(rays), dtype=torch.bool))
     assert (bank.draw(len(bank.active), generator)[1][:, 3] > 0).all()
+
+
+@pytest.mark.parametrize("reshuffle", [False, True])
+def test_nothing_to_draw_is_said_in_one_line(scene, reshuffle):
+    bank = RayBank(scene.train, reshuffle=reshuffle)
+    bank.active = bank.active[:0]
+    with pytest.raises(InputError, match=r"all of the \d+ pixels are transparent and see no occupied cell"):
+        bank.draw(4, torch.Generator().manual_seed(0))

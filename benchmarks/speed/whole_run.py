@@ -48,7 +48,7 @@ def peak_bytes(status: Path = Path("/proc/self/status")) -> int:
 class Stolen:
     """The share of all processors' time that the host of a virtual machine gives to others, from now on.
 
-    Seconds of a program that ran meanwhile are too long by about that share.
+    Seconds of a program that ran meanwhile are too long by that share or more, as threads wait for each other.
     """
 
     def __init__(self, stat: Path = Path("/proc/stat")) -> None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from gridreg.errors import InputError
 from gridreg.rendering import OccupancyGrid, Rays, backends, box_intersection, pixel_rays
 from gridreg.scenes import Scene, Views, ndc_rays
 
@@ -76,7 +77,16 @@ class RayBank:
         return rays if self.warp is None else self.warp(rays)
 
     def draw(self, count: int, generator: torch.Generator) -> tuple[Rays, Tensor]:
-        """``count`` random rays among the active ones and their RGBA ``(R, 4)``."""
+        """``count`` random rays among the active ones and their RGBA ``(R, 4)``.
+
+        Raises:
+            InputError: if no ray is active.
+        """
+        if not len(self.active):
+            raise InputError(
+                f"training pictures: all of the {len(self.pixels)} pixels are transparent and see no occupied cell, "
+                "expected some to train on"
+            )
         if self.reshuffle:
             index = self._next(count, generator)
         else:

@@ -138,7 +138,7 @@ class Trainer:
             patch = (settings.patches, settings.patch_size, settings.patch_size)
         jitter = torch.rand(len(rays), generator=self.generator)
         default = self.scene.background.to(rgba)
-        background, opacity = None, torch.full_like(jitter, math.nan)
+        background, opacity = None, rgba.new_full((len(rays),), math.nan)
         # Behind opaque pictures on one colour, random ones would be answered with walls of that colour.
         if self.scene.train.backdrop is None:
             background = self.handle.background(len(rays), self.generator, default)
@@ -159,9 +159,8 @@ class Trainer:
             generator=self.generator,
         )
         assert rendered.samples is not None
-        return replace(
-            rendered, samples=rendered.samples.replace(target_opacity=opacity, patch=patch)
-        ), target
+        samples = rendered.samples.replace(target_opacity=opacity, patch=patch)
+        return replace(rendered, samples=samples), target
 
     def train_step(self) -> StepReport:
         """One iteration.
