@@ -263,9 +263,9 @@ scenes, so they are not part of the project.
 * chair, `best` (r_72, 25.9 dB; r_152, 29.7 dB): upright, closed, patterns readable. The ornaments are blurred where
   they sit on thin wood, the shadow side of the legs is brownish and hazy, the armrest's cloth has lost its pattern, and
   seat and back are a little too bright all over: their sheen is seen from one direction by one training view.
-* chair and lego, `best-long` (r_72, 25.8 dB, and r_160, 27.6 dB; r_144, 29.9 dB, and r_72, 26.0 dB): the faults of
+* chair and lego, `best-long` (r_72, 25.9 dB, and r_160, 27.7 dB; r_144, 29.8 dB, and r_72, 25.9 dB): the faults of
   `best`, fainter; on lego the studs on top, one pixel wide, and the line below the ground plate stand out.
-* chair with `fewtensorf8` (r_152: `tensorf` 23.7, `few_tensorf_10k` 21.7, `best` 25.9 dB): from the front, where those
+* chair with `fewtensorf8` (r_152: `tensorf` 23.7, `few_tensorf_10k` 21.7, `best` 25.7 dB): from the front, where those
   views are few, `tensorf` mixes pattern and ground of the cloth into one mottled green, and legs and edges are frayed.
   `few_tensorf_10k` keeps more of the pattern, but armrests, front legs and the rim below the seat are torn to shreds
   that the white shows through, and so is the back's foot. `best` keeps pattern and wood; the rim and the right leg are

@@ -79,6 +79,16 @@ ROWS = {
         "twice as many rays in half as many iterations", "four octaves of the direction",
     ],
     "best_precision": ["float32", "bfloat16"],
+    "best_draws": ["with replacement", "every pixel once"],
+    "best_shorter": [
+        "3,000 iterations", "2,300 iterations", "1,536 rays in 1,800 iterations", "2,048 rays in 1,600 iterations",
+        "1,536 rays in 1,600 iterations",
+    ],
+    "best_faster": ["best", "hidden layers of 64", "steps of 1.5 cells"],
+    "best_unseen": [
+        "best", "depth smoothness 0.001", "depth smoothness as in RegNeRF", "divergence of neighbours", "space annealing",
+        "gradients by distance",
+    ],
     "best_components": ["best", "24 components of appearance"],
     "best_background": ["drawn backgrounds", "backgrounds in expectation"],
     "best_full": ["best", "distortion 0.01", "learning rate of grids 0.04", "total variation 0.006"],
