@@ -86,8 +86,8 @@ ROWS = {
     ],
     "best_faster": ["best", "hidden layers of 64", "steps of 1.5 cells"],
     "best_unseen": [
-        "best", "depth smoothness 0.001", "depth smoothness as in RegNeRF", "divergence of neighbours", "space annealing",
-        "gradients by distance",
+        "best", "depth smoothness 0.001", "depth smoothness as in RegNeRF", "divergence of neighbours",
+        "space annealing", "gradients by distance",
     ],
     "best_components": ["best", "24 components of appearance"],
     "best_background": ["drawn backgrounds", "backgrounds in expectation"],
