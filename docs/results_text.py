@@ -23,9 +23,10 @@ fine-tuned row has FreeNeRF's range from the near plane, that of the raw one cou
 `few_tensorf_finetuned` is the fine-tuned row with what helped it on validation views; it is no part of the paper.
 
 All runs but those of `best` and `best-long` draw pixels with replacement, where TensoRF's own program draws each once
-before any again (`train.reshuffle`); for `best` that was worth 0.1 to 0.2 dB. It is the same for all others, so what
-separates them is something else. `best` had 3,000 iterations of 1,024 rays and drew with replacement when most of its
-studies were made, which set that; the first two of them are about the change.
+before any again (`train.reshuffle`); what that is worth to `best`, two of its studies say. It is the same for all
+others, so what separates them is something else. `best` had 3,000 iterations of 1,024 rays and drew with replacement
+when most of its studies were made, which set that; those of its draws, its length, its pieces at full length and unseen
+views are of `best` as it is.
 
 """
 

@@ -46,6 +46,11 @@ ROWS = {
         "dropout", "initial opacity 0.5", "half the step", "to 200 cubed", "cheaper iterations",
         "cheaper, mean of the last fifth",
     ],
+    "best_each": [
+        "best", "no small pieces", "no distortion", "no occlusion loss", "no L1", "no mean of the last fifth",
+        "pixels with replacement", "white background", "no total variation",
+        "slower learning as in TensoRF", "no carving", "no pools and all gradients",
+    ],
     "best_leave_one_out": [
         "best", "no distortion", "no occlusion loss", "no L1", "no L1 and no occlusion loss", "no total variation",
         "white background",
