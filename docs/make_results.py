@@ -239,19 +239,23 @@ def front_gains(runs: Runs) -> str:
 
 
 def front_times(store: Path = STUDY_STORE / "speed") -> str:
-    """What README.md shows of whole runs of `best` with nothing beside them: seconds of training, by processor."""
-    found: dict[str, dict[str, list[tuple[float, str]]]] = {}
-    for record in records_in(store, "schedule-*-best-seed0-2threads*.json"):
-        stolen = record.get("stolen")
-        share = "" if stolen is None else f" ({stolen:.0%} stolen)"
-        times = found.setdefault(record["versions"]["cpu"], {}).setdefault(record["scene"], [])
-        seconds = record["seconds"]["train"]
-        times.append((seconds, f"{seconds:.0f}{share}"))
+    """What README.md shows of whole runs with nothing beside them: seconds of training, by preset and processor."""
+    found: dict[tuple[str, str], dict[str, list[tuple[float, str]]]] = {}
+    for preset in ("best", "best-long"):
+        for record in records_in(store, f"schedule-*-{preset}-seed0-2threads*.json"):
+            stolen = record.get("stolen")
+            share = "" if stolen is None else f" ({stolen:.0%} stolen)"
+            times = found.setdefault((preset, record["versions"]["cpu"]), {}).setdefault(record["scene"], [])
+            seconds = record["seconds"]["train"]
+            times.append((seconds, f"{seconds:.0f}{share}"))
     rows = [
-        [cpu, *("; ".join(text for _, text in sorted(times.get(scene, [(0.0, "–")]))) for scene in SCENES)]
-        for cpu, times in sorted(found.items())
+        [
+            f"`{preset}`, {cpu}",
+            *("; ".join(text for _, text in sorted(times.get(scene, [(0.0, "–")]))) for scene in SCENES),
+        ]
+        for (preset, cpu), times in sorted(found.items())
     ]
-    return table(["`best` alone on two cores: training (s)", *SCENES], rows)
+    return table(["alone on two cores: training (s)", *SCENES], rows)
 
 
 def with_front(readme: str, runs: Runs) -> str:

@@ -164,6 +164,7 @@ def test_the_readme_has_times_by_processor(results: ModuleType, tmp_path: Path) 
         ("schedule-chair-best-seed0-2threads", "One", "chair", 197.2),
         ("schedule-lego-best-seed0-2threads-again", "One", "lego", 90.0),
         ("schedule-lego-best-seed0-2threads-other", "Other", "lego", 163.4),
+        ("schedule-lego-best-long-seed0-2threads", "One", "lego", 650.0),
         ("schedule-lego-quick-seed0-2threads", "One", "lego", 50.0),
     ):
         record = {"scene": scene, "versions": {"cpu": cpu}, "seconds": {"train": seconds}}
@@ -171,7 +172,11 @@ def test_the_readme_has_times_by_processor(results: ModuleType, tmp_path: Path) 
             record["stolen"] = 0.281
         (tmp_path / f"{name}.json").write_text(json.dumps(record))
     rows = results.front_times(tmp_path).splitlines()[2:]
-    assert rows == ["| One | 90; 232 | 197 |", "| Other | 163 (28% stolen) | – |"]
+    assert rows == [
+        "| `best`, One | 90; 232 | 197 |",
+        "| `best`, Other | 163 (28% stolen) | – |",
+        "| `best-long`, One | 650 | – |",
+    ]
 
 
 def test_times_are_medians_over_seeds(results: ModuleType, tmp_path: Path) -> None:
