@@ -15,6 +15,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent))
 from results_claims import claims, targets
+from results_remedies import remedies
 from results_runs import (
     ENSEMBLE_STORE,
     STORE,
@@ -23,6 +24,7 @@ from results_runs import (
     psnr,
     records_in,
     ssim,
+    study_gains,
     table,
     time_taken,
     with_interval,
@@ -91,35 +93,38 @@ def study_tables(folder: Path = STUDY_STORE) -> str:
         records = records_in(folder / name)
         if records:
             first = records[0]
-            where = f"`{first['protocol']}`, {first['steps']} iterations, `examples/studies/{name}.yaml`"
+            steps = sorted({record["steps"] for record in records})
+            length = " to ".join(str(count) for count in dict.fromkeys((steps[0], steps[-1])))
+            where = f"`{first['protocol']}`, {length} iterations, `examples/studies/{name}.yaml`"
             parts.append(f"\n## {title}\n\n{about} {where}.\n\n{study_table(records)}")
     return "".join(parts)
 
 
 def study_table(records: Sequence[dict[str, Any]]) -> str:
     """The rows of one study: the baseline, then the others from the best difference to the worst."""
-    found: dict[str, dict[tuple[str, int], float]] = {}
-    for record in records:
-        found.setdefault(record["label"], {})[record["scene"], record["seed"]] = psnr(record)
+    labels = sorted({record["label"] for record in records})
     scenes = sorted({record["scene"] for record in records})
+    baseline = records[0]["baseline"]
 
-    def cells(runs: dict[tuple[str, int], float]) -> list[str]:
-        by_scene = ([value for (where, _), value in runs.items() if where == scene] for scene in scenes)
+    def cells(label: str) -> list[str]:
+        runs = [record for record in records if record["label"] == label]
+        by_scene = ([psnr(record) for record in runs if record["scene"] == scene] for scene in scenes)
         return [with_spread(estimate(values) if values else None) for values in by_scene]
 
-    base = found.pop(records[0]["baseline"], {})
     compared = []
-    for label, runs in found.items():
-        gains = [runs[pair] - base[pair] for pair in sorted(runs.keys() & base.keys())]
+    for label in labels:
+        if label == baseline:
+            continue
+        gains = study_gains(records, label)
         if gains:
             mean = estimate(gains).mean
             told = [signed(mean), f"{signed(min(gains))} to {signed(max(gains))}"]
         else:
             mean, told = -math.inf, ["–", ""]
-        compared.append((mean, [label, *cells(runs), *told]))
-    compared.sort(key=lambda row: -row[0])
+        compared.append((mean, [label, *cells(label), *told]))
+    compared.sort(key=lambda row: (-row[0], row[1]))
     head = ["row", *(f"{scene} (runs)" for scene in scenes), "mean difference (dB)", "least to most"]
-    first = [[records[0]["baseline"], *cells(base), "", ""]] if base else []
+    first = [[baseline, *cells(baseline), "", ""]] if baseline in labels else []
     return table(head, [*first, *(row for _, row in compared)])
 
 
@@ -191,6 +196,7 @@ def page(runs: Runs) -> str:
         ensembles(),
         beside_plain(),
         PICTURES,
+        remedies(),
         study_tables(),
     ]
     return "".join(parts)

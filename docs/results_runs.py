@@ -68,6 +68,16 @@ def ssim(record: dict[str, Any]) -> float:
     return float(record["mean"]["ssim_gaussian"])
 
 
+def study_gains(records: Sequence[dict[str, Any]], label: str) -> list[float]:
+    """Differences of PSNR (dB) of a study's row to its baseline, over the pairs of scene and seed that both have."""
+    found: dict[str, dict[tuple[str, int], float]] = {}
+    for record in records:
+        found.setdefault(record["label"], {})[record["scene"], record["seed"]] = psnr(record)
+    base = found.get(records[0]["baseline"], {}) if records else {}
+    row = found.get(label, {})
+    return [row[pair] - base[pair] for pair in sorted(row.keys() & base.keys())]
+
+
 def time_taken(records: dict[int, dict[str, Any]]) -> str:
     """``7.1; 1/2``: minutes of training, the median of the seeds, and how many threads each had; or a dash."""
     if not records:

@@ -128,9 +128,19 @@ STUDIES = (
         "of 1,536, which leaves three minutes some room on the slower processor.",
     ),
     (
+        "best_each",
+        "Pieces of `best` at its full length",
+        "One piece left out at a time; what a negative figure says is lost without it.",
+    ),
+    (
+        "best_unseen",
+        "Unseen views and the space before the cameras, with `best`",
+        "",
+    ),
+    (
         "best_leave_one_out",
-        "Pieces of `best`",
-        "One piece left out at a time; what a negative figure says is lost without it. Occlusion loss, L1 and "
+        "Pieces of `best` as it was, after a third of its iterations",
+        "As above, with three seeds. Occlusion loss, L1 and "
         "distortion give about a tenth of a decibel each, lego more than chair, and seeds differ by more than that; "
         "the mean of the last fifth gives little, in every pair, and costs nothing. Measured when backgrounds were "
         'drawn; "no random background" is a white one.',

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from gridreg.ablation.study import load_study
 from tests.programs import ROOT, module_at
 
 
@@ -114,6 +115,40 @@ def test_studies_are_compared_with_their_baseline(results: ModuleType, tmp_path:
         "| better | – | 27.25 (1) | +0.25 | +0.25 to +0.25 |",
         "| worse | 28.50 (1) | 26.50 (1) | −0.50 | −0.50 to −0.50 |",
     ]
+
+
+def test_remedies_are_told_by_what_their_rows_say(results: ModuleType, tmp_path: Path) -> None:
+    assert results.remedies(tmp_path) == ""
+    more = {"protocol": "dietnerf8-validation", "baseline": "best"}
+    folder = tmp_path / "best_each"
+    folder.mkdir()
+    for scene, level, bare in (("lego", 29.0, 27.0), ("chair", 30.0, 29.5)):
+        store(folder, "best", scene, 0, level, label="best", steps=1600, **more)
+        store(folder, "best", scene, 1, bare, label="no carving", steps=1600, **more)
+        store(folder, "best", scene, 0, bare, label="no carving", steps=1600, **more)
+    folder = tmp_path / "best_more"
+    folder.mkdir()
+    store(folder, "best", "lego", 0, 29.0, label="best", steps=3000, **more)
+    store(folder, "best", "lego", 0, 28.25, label="low-pass", steps=1000, **more)
+    assert [line for line in results.remedies(tmp_path).splitlines() if line.startswith("| ")][2:] == [
+        "| visual hull of the alpha as a start | +1.25 (2) | +0.50 to +2.00 | yes | `best_each`, 1,600 |",
+        "| low-pass | −0.75 (1) |  |  | `best_more`, 1,000 |",
+    ]
+
+
+def test_remedies_name_rows_of_shipped_studies(
+    results: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for scene in ("lego", "chair"):
+        (tmp_path / "nerf_synthetic" / scene).mkdir(parents=True)
+    monkeypatch.setenv("GRIDREG_DATA", str(tmp_path))
+    listed = module_at(ROOT / "docs" / "results_remedies.py").ALL
+    assert len({remedy.name for remedy in listed}) == len(listed)
+    for remedy in listed:
+        assert remedy.study in {name for name, _, _ in results.STUDIES}
+        study = load_study(ROOT / "examples" / "studies" / f"{remedy.study}.yaml")
+        assert remedy.row in study.labels
+        assert remedy.row != study.baseline
 
 
 def test_ensembles_stand_beside_their_members(results: ModuleType, tmp_path: Path) -> None:
