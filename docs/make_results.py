@@ -173,7 +173,7 @@ def beside_plain(folder: Path = STORE) -> str:
     return (
         "\n## The compiled path beside the plain one\n\nTrained by plain PyTorch (`benchmarks/quality.py --backend "
         "torch`) and by the compiled kernels, in equal steps,\nwith one thread beside another run, and both scored by "
-        "the kernels. "
+        "the kernels; `quick` drew with replacement then. "
         f"Mean difference: {with_interval(estimate(gains))} dB.\n\n" + table(head, rows)
     )
 

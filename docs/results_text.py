@@ -22,9 +22,10 @@ scatter by 1 to 2 dB between papers, so only rows of one program under one proto
 fine-tuned row has FreeNeRF's range from the near plane, that of the raw one counts samples from the box.
 `few_tensorf_finetuned` is the fine-tuned row with what helped it on validation views; it is no part of the paper.
 
-All runs but those of `best` and `best-long` draw pixels with replacement, where TensoRF's own program draws each once
-before any again (`train.reshuffle`); what that is worth to `best`, two of its studies say. It is the same for all
-others, so what separates them is something else. `best` had 3,000 iterations of 1,024 rays and drew with replacement
+All runs but those of `best`, `best-long` and `quick` draw pixels with replacement, where TensoRF's own program draws
+each once before any again (`train.reshuffle`); what that is worth to `best`, which sees every pixel a few times, two of
+its studies say. The published schedules draw longer, which leaves less to chance, but what it would be worth to them
+was not measured; it is the same for all of them. `best` had 3,000 iterations of 1,024 rays and drew with replacement
 when most of its studies were made, which set that; those of its draws, its length, its pieces at full length and unseen
 views are of `best` as it is.
 
