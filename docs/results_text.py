@@ -278,6 +278,10 @@ scenes, so they are not part of the project.
 * chair, `best` (r_72, 25.9 dB; r_152, 29.7 dB): upright, closed, patterns readable. The ornaments are blurred where
   they sit on thin wood, the shadow side of the legs is brownish and hazy, the armrest's cloth has lost its pattern, and
   seat and back are a little too bright all over: their sheen is seen from one direction by one training view.
+* lego and chair, `quick` (r_144, 27.4 dB, and r_80, 21.9 dB; r_152, 28.1 dB): upright, colours right, blurred by about
+  one stud. The bucket's inside is smeared; in the low view grey haze hangs below the plate, and wheels and tracks run
+  together. The chair's ornaments and the cloth's pattern are soft, crumbs hang beside the left armrest; the streak of
+  white at the seat's front edge that `best` has in this view is not there.
 * chair and lego, `best-long` (r_72, 25.9 dB, and r_160, 27.7 dB; r_144, 29.8 dB, and r_72, 25.9 dB): the faults of
   `best`, fainter; on lego the studs on top, one pixel wide, and the line below the ground plate stand out.
 * chair with `fewtensorf8` (r_152: `tensorf` 23.7, `few_tensorf_10k` 21.7, `best` 25.7 dB): from the front, where those
