@@ -26,8 +26,8 @@ All runs but those of `best`, `best-long` and `quick` draw pixels with replaceme
 each once before any again (`train.reshuffle`); what that is worth to `best`, which sees every pixel a few times, two of
 its studies say. The published schedules draw longer, which leaves less to chance, but what it would be worth to them
 was not measured; it is the same for all of them. `best` had 3,000 iterations of 1,024 rays and drew with replacement
-when most of its studies were made, which set that; those of its draws, its length, its pieces at full length and unseen
-views are of `best` as it is.
+when most of its studies were made, which set that; those of its draws, its length and its pieces at full length are of
+`best` as it is.
 
 """
 
@@ -139,7 +139,8 @@ STUDIES = (
     (
         "best_unseen",
         "Unseen views and the space before the cameras, with `best`",
-        "",
+        "Penalties on patches from cameras between the training ones, rays sampled around their middle first, and "
+        "gradients scaled by distance.",
     ),
     (
         "best_leave_one_out",
