@@ -290,6 +290,8 @@ scenes, so they are not part of the project.
   `few_tensorf_10k` keeps more of the pattern, but armrests, front legs and the rim below the seat are torn to shreds
   that the white shows through, and so is the back's foot. `best` keeps pattern and wood; the rim and the right leg are
   broken, and the seat is too bright on its right.
+* chair with `fewtensorf8`, `few_tensorf` (r_152, 21.3 dB): as `few_tensorf_10k`, and worse: the back's pattern is lost
+  in brown, a torn streak of white lies across its foot, the rim below the seat is gone but for specks, legs fade.
 * lego with `fewtensorf8` (r_128: `tensorf` 21.2, `few_tensorf_10k` 20.9, `best` 21.5 dB), from low, where no training
   view looks from: all three make the plate thicker than it is. Under it hang streaks of fog in `few_tensorf_10k`,
   specks in rows in `tensorf` and a faint haze in `best`. Wheels and front are blotched and bleached by `tensorf`,
