@@ -296,6 +296,8 @@ scenes, so they are not part of the project.
   view looks from: all three make the plate thicker than it is. Under it hang streaks of fog in `few_tensorf_10k`,
   specks in rows in `tensorf` and a faint haze in `best`. Wheels and front are blotched and bleached by `tensorf`,
   blotched by `few_tensorf_10k` and blurred by `best`.
+* lego with `fewtensorf8`, `few_tensorf` (r_128, 21.1 dB): a comb of grey streaks and a black shred hang in the air
+  below the plate, body and wheels are blotched with black and orange, crumbs hang before the bucket.
 * lego and chair with `fewtensorf8`, `few_tensorf_finetuned` (r_128, 19.9 dB; r_152, 24.3 dB): below lego's plate hangs
   a fringe of haze in every low view, and brown specks around the bucket's teeth. The chair is whole from all sides, rim
   and legs too; from the front its pattern is blurred, and crumbs hang beside the left front leg.
