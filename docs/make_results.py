@@ -21,6 +21,7 @@ from results_runs import (
     STORE,
     STUDY_STORE,
     Runs,
+    least_to_most,
     psnr,
     records_in,
     ssim,
@@ -112,13 +113,11 @@ def study_table(records: Sequence[dict[str, Any]]) -> str:
         return [with_spread(estimate(values) if values else None) for values in by_scene]
 
     compared = []
-    for label in labels:
-        if label == baseline:
-            continue
+    for label in (label for label in labels if label != baseline):
         gains = study_gains(records, label)
         if gains:
             mean = estimate(gains).mean
-            told = [signed(mean), f"{signed(min(gains))} to {signed(max(gains))}"]
+            told = [signed(mean), least_to_most(gains)]
         else:
             mean, told = -math.inf, ["–", ""]
         compared.append((mean, [label, *cells(label), *told]))

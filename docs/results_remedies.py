@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from results_runs import STUDY_STORE, records_in, study_gains, table
+from results_runs import STUDY_STORE, least_to_most, records_in, study_gains, table
 
 from gridreg.ablation.statistics import estimate
 from gridreg.ablation.tables import signed
@@ -80,13 +80,15 @@ ALL = (
 
 def remedies(folder: Path = STUDY_STORE) -> str:
     """Every remedy from the greatest gain to the greatest loss; nothing without a study."""
+    studies = {study: records_in(folder / study) for study in sorted({remedy.study for remedy in ALL})}
     found = []
     for remedy in ALL:
-        records = records_in(folder / remedy.study)
-        gains = [-gain if remedy.left_out else gain for gain in study_gains(records, remedy.row)]
+        records = studies[remedy.study]
+        gains = study_gains(records, remedy.row) if records else []
         if gains:
+            gains = [-gain for gain in gains] if remedy.left_out else gains
             mean = estimate(gains).mean
-            spread = f"{signed(min(gains))} to {signed(max(gains))}" if len(gains) > 1 else ""
+            spread = least_to_most(gains) if len(gains) > 1 else ""
             steps = next(record["steps"] for record in records if record["label"] == remedy.row)
             study = f"`{remedy.study}`, {steps:,}"
             row = [remedy.name, f"{signed(mean)} ({len(gains)})", spread, "yes" if remedy.kept else "", study]

@@ -70,12 +70,16 @@ def ssim(record: dict[str, Any]) -> float:
 
 def study_gains(records: Sequence[dict[str, Any]], label: str) -> list[float]:
     """Differences of PSNR (dB) of a study's row to its baseline, over the pairs of scene and seed that both have."""
-    found: dict[str, dict[tuple[str, int], float]] = {}
-    for record in records:
-        found.setdefault(record["label"], {})[record["scene"], record["seed"]] = psnr(record)
-    base = found.get(records[0]["baseline"], {}) if records else {}
-    row = found.get(label, {})
+    row, base = (
+        {(record["scene"], record["seed"]): psnr(record) for record in records if record["label"] == wanted}
+        for wanted in (label, records[0]["baseline"])
+    )
     return [row[pair] - base[pair] for pair in sorted(row.keys() & base.keys())]
+
+
+def least_to_most(gains: Sequence[float]) -> str:
+    """``−0.18 to +0.10``."""
+    return f"{signed(min(gains))} to {signed(max(gains))}"
 
 
 def time_taken(records: dict[int, dict[str, Any]]) -> str:
