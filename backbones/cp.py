@@ -8,10 +8,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from backbones import kernels
 from backbones.tensorial import TensorialField
-from gridreg.attach import open_channels
-from gridreg.sites import Site, parameters
+from gridreg import ops
+from gridreg.attach._hooks import open_channels
+from gridreg.attach.sites import Site, parameters
 
 __all__ = ["LINE_AXES", "CPField"]
 
@@ -55,19 +55,17 @@ class CPField(TensorialField):
 
     def density_features(self, u: Tensor) -> Tensor:
         """``G(x)``: normalised positions ``(N, 3)`` to ``(N,)``."""
-        return kernels.cp_density(u, list(self.density_lines), _open_components(self.density_lines))
+        return ops.cp_density(u, list(self.density_lines), _open_components(self.density_lines))
 
     def appearance_features(self, u: Tensor) -> Tensor:
         """Normalised positions ``(N, 3)`` to the products of the components ``(N, C)``."""
-        return kernels.cp_features(u, list(self.appearance_lines), _open_components(self.appearance_lines))
+        return ops.cp_features(u, list(self.appearance_lines), _open_components(self.appearance_lines))
 
     def _marched(
-        self, march: kernels.March, activation: kernels.Activation, transmittance_bound: float
+        self, march: ops.March, activation: ops.Activation, transmittance_bound: float
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         opened = _open_components(self.density_lines)
-        return kernels.cp_march_density(
-            march, activation, transmittance_bound, list(self.density_lines), opened
-        )
+        return ops.cp_march_density(march, activation, transmittance_bound, list(self.density_lines), opened)
 
     @torch.no_grad()
     def resample(self, resolution: tuple[int, int, int]) -> None:

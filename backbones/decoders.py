@@ -10,11 +10,11 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from backbones import kernels
-from backbones.kernels.linear import Precision
-from gridreg.attach import open_channels
+from gridreg import ops
+from gridreg.attach._hooks import open_channels
+from gridreg.attach.sites import Site, inputs, parameters
 from gridreg.encodings import octaves_of_channels
-from gridreg.sites import Site, inputs, parameters
+from gridreg.ops.linear import Precision
 
 __all__ = ["DECODERS", "Basis", "MLPDecoder", "RGBDecoder", "SHDecoder", "make_decoder"]
 
@@ -25,7 +25,7 @@ class Basis(nn.Linear):
     Args:
         components: that it reads.
         features: that it gives.
-        precision: of the product on the CPU, see `backbones.kernels.mlp`.
+        precision: of the product on the CPU, see `gridreg.ops.mlp`.
     """
 
     def __init__(self, components: int, features: int, precision: Precision = "auto") -> None:
@@ -35,11 +35,11 @@ class Basis(nn.Linear):
     @property
     def input_dtype(self) -> torch.dtype:
         """What it rounds its input to."""
-        return kernels.product_dtype(self.precision)
+        return ops.product_dtype(self.precision)
 
     def forward(self, components: Tensor) -> Tensor:
         """Components ``(N, C)``, float32 or `input_dtype`, to features ``(N, F)``, float32."""
-        return kernels.mlp(components, [(self.weight, None)], precision=self.precision)
+        return ops.mlp(components, [(self.weight, None)], precision=self.precision)
 
 
 class MLPDecoder(nn.Module):
@@ -53,7 +53,7 @@ class MLPDecoder(nn.Module):
         feature_octaves, direction_octaves: octaves of the encodings (2 and 2 for ``MLP_Fea``).
         position_octaves: octaves of the position's encoding; None leaves the position out.
         width: hidden width.
-        precision: of the matrix products on the CPU, see `backbones.kernels.mlp`.
+        precision: of the matrix products on the CPU, see `gridreg.ops.mlp`.
     """
 
     layers: nn.ModuleList
@@ -101,17 +101,17 @@ class MLPDecoder(nn.Module):
             ray_indices: ``(N,)``: the ray of each sample; its direction is then encoded once per ray.
         """
         blocks = [
-            kernels.Block(features, self.feature_octaves),
-            kernels.Block(directions, self.direction_octaves, ray_indices),
+            ops.Block(features, self.feature_octaves),
+            ops.Block(directions, self.direction_octaves, ray_indices),
         ]
         if self.position_octaves is not None:
-            blocks.append(kernels.Block(positions, self.position_octaves))
+            blocks.append(ops.Block(positions, self.position_octaves))
         blocks, first = self._open(blocks)
         layers = [(first, self.layers[0].bias), *((layer.weight, layer.bias) for layer in self.layers[1:])]
-        out = kernels.encoded_mlp(blocks, layers, precision=self.precision)  # type: ignore[arg-type]
+        out = ops.encoded_mlp(blocks, layers, precision=self.precision)  # type: ignore[arg-type]
         return torch.sigmoid(out)
 
-    def _open(self, blocks: list[kernels.Block]) -> tuple[list[kernels.Block], Tensor]:
+    def _open(self, blocks: list[ops.Block]) -> tuple[list[ops.Block], Tensor]:
         """The encodings without the octaves that masks have closed altogether, and the weight's columns for them."""
         parts, columns, start = [], [], 0
         for block in blocks:

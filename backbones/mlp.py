@@ -9,14 +9,15 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from backbones import kernels
 from backbones.hierarchical import intervals, inverse_transform, stratified
-from backbones.kernels.adam import FusedAdam
-from backbones.kernels.linear import Precision
 from backbones.tensorial import density_shift_for
+from gridreg import ops
+from gridreg.attach.sites import Site, parameters
 from gridreg.encodings import octaves_of_channels
-from gridreg.rendering import Marched, OccupancyGrid, Rays, backends
-from gridreg.sites import Site, parameters
+from gridreg.ops import rays as backends
+from gridreg.ops.cpu.adam.optimizer import FusedAdam
+from gridreg.ops.linear import Precision
+from gridreg.rendering import Marched, OccupancyGrid, Rays
 
 __all__ = ["MLPField"]
 
@@ -50,7 +51,7 @@ class MLPField(nn.Module):
         coarse_samples, fine_samples: per ray (64 and 128 in NeRF).
         initial_opacity: of a ray along the mean edge of the box before training. (mip-NeRF's shift of -1 makes 0.6 of
             it in the synthetic scenes.)
-        precision: of the matrix products on the CPU, see `backbones.kernels.mlp`.
+        precision: of the matrix products on the CPU, see `gridreg.ops.mlp`.
         generator: for the initial weights.
 
     Raises:
@@ -126,11 +127,11 @@ class MLPField(nn.Module):
         """The trunk: positions ``(N, 3)`` to hidden units ``(N, width)``."""
         centre = self.bounds.mean(0)
         third = (self.bounds[1] - self.bounds[0]).max() / 3
-        encoded = kernels.encode((x - centre) / third, self.position_octaves)
+        encoded = ops.encode((x - centre) / third, self.position_octaves)
         before, after = self.trunk[: self.skip + 1], self.trunk[self.skip + 1 :]
-        hidden = torch.relu(kernels.mlp(encoded, _pairs(before), precision=self.precision))
+        hidden = torch.relu(ops.mlp(encoded, _pairs(before), precision=self.precision))
         again = torch.cat([encoded, hidden], dim=-1)
-        return torch.relu(kernels.mlp(again, _pairs(after), precision=self.precision))
+        return torch.relu(ops.mlp(again, _pairs(after), precision=self.precision))
 
     def _density_of(self, hidden: Tensor) -> Tensor:
         """Hidden units ``(N, width)`` to densities ``(N,)`` per world unit."""
@@ -163,10 +164,10 @@ class MLPField(nn.Module):
 
     def _colour_of(self, hidden: Tensor, directions: Tensor, ray_indices: Tensor | None) -> Tensor:
         first, last = (cast(nn.Linear, layer) for layer in self.colour_layers)
-        encoded = kernels.encode(directions, self.direction_octaves)
+        encoded = ops.encode(directions, self.direction_octaves)
         weight, columns = first.weight, encoded.shape[1]
-        out = kernels.mlp(
-            kernels.mlp(hidden, _pairs([self.bottleneck]), precision=self.precision),
+        out = ops.mlp(
+            ops.mlp(hidden, _pairs([self.bottleneck]), precision=self.precision),
             [(weight[:, columns:], None), (last.weight, last.bias)],
             offset=F.linear(encoded, weight[:, :columns], first.bias),
             rows=ray_indices,

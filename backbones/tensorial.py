@@ -11,11 +11,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from backbones import kernels
 from backbones.decoders import Basis, make_decoder
-from backbones.kernels.adam import FusedAdam
+from gridreg import ops
+from gridreg.attach.sites import Site
+from gridreg.ops.cpu.adam.optimizer import FusedAdam
 from gridreg.rendering import Marched, OccupancyGrid, Rays
-from gridreg.sites import Site
 
 __all__ = ["TensorialField", "density_shift_for"]
 
@@ -159,14 +159,14 @@ class TensorialField(nn.Module):
             jitter: ``(R,)`` in [0, 1).
             transmittance_bound: samples behind this transmittance are dropped.
         """
-        march = kernels.March(
+        march = ops.March(
             rays.origins, rays.directions, t_min, t_max, step, occupancy.cells, occupancy.bounds, jitter
         )
-        activation = kernels.Activation(self.bounds, self.density_shift, self.distance_scale)
+        activation = ops.Activation(self.bounds, self.density_shift, self.distance_scale)
         return Marched(*self._marched(march, activation, transmittance_bound))
 
     def _marched(
-        self, march: kernels.March, activation: kernels.Activation, transmittance_bound: float
+        self, march: ops.March, activation: ops.Activation, transmittance_bound: float
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         raise TypeError(f"{type(self).__name__} must define _marched")
 
@@ -241,9 +241,9 @@ class TensorialField(nn.Module):
     def gradient_context(self, faint: float = 0.0) -> AbstractContextManager[None]:
         """Around a trainer's backward pass: gradients of planes are added to buffers that stay.
 
-        ``faint``: see `backbones.kernels.accumulate_into_grad`.
+        ``faint``: see `gridreg.ops.accumulate_into_grad`.
         """
-        return kernels.accumulate_into_grad(faint)
+        return ops.accumulate_into_grad(faint)
 
     def sites(self) -> dict[str, Site]:
         """The encodings of the decoder; subclasses add their grids."""

@@ -8,10 +8,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from backbones import kernels
 from backbones.tensorial import TensorialField
-from gridreg.attach import open_channels
-from gridreg.sites import Site, parameters
+from gridreg import ops
+from gridreg.attach._hooks import open_channels
+from gridreg.attach.sites import Site, parameters
 
 __all__ = ["LINE_AXES", "PLANE_AXES", "VMField"]
 
@@ -53,7 +53,7 @@ class VMField(TensorialField):
 
     def density_features(self, u: Tensor) -> Tensor:
         """``G(x)``: normalised positions ``(N, 3)`` to ``(N,)``."""
-        return kernels.vm_density(
+        return ops.vm_density(
             u,
             list(self.density_planes),
             list(self.density_lines),
@@ -70,13 +70,13 @@ class VMField(TensorialField):
     def _products(self, u: Tensor, dtype: torch.dtype) -> Tensor:
         opened = _open_components(self.appearance_planes, self.appearance_lines)
         planes, lines = list(self.appearance_planes), list(self.appearance_lines)
-        return kernels.vm_features(u, planes, lines, opened, dtype)
+        return ops.vm_features(u, planes, lines, opened, dtype)
 
     def _marched(
-        self, march: kernels.March, activation: kernels.Activation, transmittance_bound: float
+        self, march: ops.March, activation: ops.Activation, transmittance_bound: float
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         opened = _open_components(self.density_planes, self.density_lines)
-        return kernels.vm_march_density(
+        return ops.vm_march_density(
             march,
             activation,
             transmittance_bound,

@@ -1,23 +1,33 @@
 """Regularizers for grid radiance fields, attached from the outside."""
 
-from gridreg.apply import apply
-from gridreg.attach import open_channels, strip
+from gridreg.attach._hooks import open_channels, strip
+from gridreg.attach._resolve import register_adapter, sites_of
+from gridreg.attach.apply import apply
+from gridreg.attach.handle import Handle
+from gridreg.attach.sites import Grid, Place, Selector, Site, inputs, outputs, parameters
 from gridreg.base import REGISTRY, Clock, Context, LocalTerm, Regularizer, overrides, register
-from gridreg.channel_masks import Mask
-from gridreg.compose import from_config, to_config
-from gridreg.compositions import composition, composition_names, register_composition
-from gridreg.dropout import ComponentDropout, component_dropout
+from gridreg.compositions.named import composition, composition_names, register_composition
+from gridreg.compositions.plain_data import from_config, to_config
 from gridreg.encodings import PositionalEncoding, octaves_of_channels, positional_encoding
 from gridreg.errors import InputError
-from gridreg.filters import fourier_low_pass, gaussian_blur
-from gridreg.finding import register_adapter, sites_of
-from gridreg.gradient_scaling import DistanceGradientScaling, scale_gradients_by_distance
-from gridreg.grid_penalties import L1, Orthogonality, TotalVariation, l1, orthogonality, total_variation
-from gridreg.handle import Handle
-from gridreg.level_masks import LevelMask, ViewDependenceMask
-from gridreg.lowpass import FourierLowPass, SpatialAnnealing, annealed_radius
-from gridreg.mask_regularizers import CosineMask, FixedMask, FrequencyMask
-from gridreg.masks import (
+from gridreg.regularizers.backgrounds import (
+    ExpectedBackground,
+    RandomBackground,
+    SpaceAnnealing,
+    anneal_space,
+    opacity_error,
+    random_background,
+)
+from gridreg.regularizers.channel_masks import CosineMask, FixedMask, FrequencyMask
+from gridreg.regularizers.density import CauchySparsity, OcclusionLoss, cauchy_sparsity, occlusion_loss
+from gridreg.regularizers.dropout import ComponentDropout, component_dropout
+from gridreg.regularizers.filters import fourier_low_pass, gaussian_blur
+from gridreg.regularizers.gradient_scaling import DistanceGradientScaling, scale_gradients_by_distance
+from gridreg.regularizers.grids import L1, Orthogonality, TotalVariation, l1, orthogonality, total_variation
+from gridreg.regularizers.level_masks import LevelMask, ViewDependenceMask
+from gridreg.regularizers.low_pass import FourierLowPass, SpatialAnnealing, annealed_radius
+from gridreg.regularizers.mask_base import Mask
+from gridreg.regularizers.mask_functions import (
     authors_frequency_mask,
     cosine_mask,
     fixed_mask,
@@ -26,10 +36,9 @@ from gridreg.masks import (
     printed_frequency_mask,
     spherical_bands,
 )
-from gridreg.optimization import LearningRate, WeightDecay, split_groups
-from gridreg.patch_penalties import DepthSmoothness, RayKL, depth_smoothness, ray_kl
-from gridreg.penalties import CauchySparsity, OcclusionLoss, cauchy_sparsity, occlusion_loss
-from gridreg.ray_penalties import (
+from gridreg.regularizers.optimizer import LearningRate, WeightDecay, split_groups
+from gridreg.regularizers.patches import DepthSmoothness, RayKL, depth_smoothness, ray_kl
+from gridreg.regularizers.rays import (
     Distortion,
     OpacityEntropy,
     RayEntropy,
@@ -38,14 +47,6 @@ from gridreg.ray_penalties import (
     ray_entropy,
 )
 from gridreg.samples import RaySamples
-from gridreg.sampling import (
-    ExpectedBackground,
-    RandomBackground,
-    SpaceAnnealing,
-    anneal_space,
-    opacity_error,
-    random_background,
-)
 from gridreg.schedules import (
     Cosine,
     Geometric,
@@ -57,7 +58,6 @@ from gridreg.schedules import (
     resolve,
 )
 from gridreg.segments import optical_depth_to_weights
-from gridreg.sites import Grid, Place, Selector, Site, inputs, outputs, parameters
 
 __all__ = [
     "CauchySparsity",

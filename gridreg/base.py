@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar
 import torch
 from torch import Tensor
 
+from gridreg.attach.sites import Grid, Place, Selector, Site, SiteLike
 from gridreg.errors import InputError
 from gridreg.schedules import Numeric, check_numeric, end_step, resolve
-from gridreg.sites import Grid, Place, Selector, Site, SiteLike
 
 if TYPE_CHECKING:
     from gridreg.samples import RaySamples

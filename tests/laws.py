@@ -11,9 +11,9 @@ import yaml
 from torch import Tensor, nn
 
 import gridreg
-from gridreg.attach import Slot, slots_of
+from gridreg.attach._hooks import Slot, slots_of
+from gridreg.attach._resolve import find
 from gridreg.base import Clock, Context, Regularizer, overrides
-from gridreg.finding import find
 from tests.fields import DESIGNS, made, points
 from tests.observations import (
     STEPS,

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor, nn
 
 import gridreg
+from gridreg.attach._resolve import find
+from gridreg.attach.sites import SiteLike
 from gridreg.base import Clock, Context, Regularizer, overrides
-from gridreg.finding import find
-from gridreg.sites import SiteLike
 from tests.fields import Design, made, points
 
 STEPS = 20

@@ -327,7 +327,7 @@ def test_modules_register_what_is_ones_own(tmp_path, monkeypatch):
     (tmp_path / "my_penalties.py").write_text(
         "import gridreg\ngridreg.register_composition('mine', lambda: [gridreg.OcclusionLoss(weight=0.5)])\n"
     )
-    from gridreg import compositions
+    from gridreg.compositions import named as compositions
 
     before = dict(compositions._COMPOSITIONS)
     try:

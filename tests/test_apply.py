@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from torch import Tensor, nn
 
 import gridreg
+from gridreg.attach.sites import SiteLike
 from gridreg.base import Context, Regularizer, overrides, register
-from gridreg.sites import SiteLike
 from tests.fields import made, points
 from tests.observations import anatomy, same
 

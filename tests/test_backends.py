@@ -11,8 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gridreg.errors import InputError
-from gridreg.rendering import choice, plain
-from gridreg.rendering.backends import (
+from gridreg.ops import dispatch as choice
+from gridreg.ops import ray_reference as plain
+from gridreg.ops.rays import (
     Backend,
     accumulate,
     chosen_backend,

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from backbones.kernels import composite
 from gridreg.errors import InputError
+from gridreg.ops.cpu import composite
 from gridreg.scenes import builtin_scene
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))

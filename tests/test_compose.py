@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import gridreg
+from gridreg.attach.sites import Selector, Site
 from gridreg.base import REGISTRY, Regularizer
 from gridreg.schedules import Schedule
-from gridreg.sites import Selector, Site
 from tests.fields import made
 
 SMALL = st.floats(0.01, 0.9)
@@ -261,7 +261,7 @@ def test_rivals_are_there() -> None:
 
 
 def test_an_unknown_composition_is_refused_and_a_new_one_can_be_registered() -> None:
-    from gridreg import compositions
+    from gridreg.compositions import named as compositions
 
     with pytest.raises(gridreg.InputError, match=r"composition='fourier'.*did you mean 'fourierf'"):
         gridreg.composition("fourier")

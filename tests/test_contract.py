@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 import gridreg
+from gridreg.attach.sites import Place, SiteLike
 from gridreg.base import REGISTRY, Clock, Context, Regularizer
 from gridreg.schedules import Numeric
-from gridreg.sites import Place, SiteLike
 from tests import laws
 from tests.fields import DESIGNS, made, points
 from tests.observations import READS_GRIDS, contexts, examples_on

@@ -8,10 +8,10 @@ from hypothesis import strategies as st
 
 import gridreg
 from backbones.cp import LINE_AXES, CPField
-from backbones.kernels import reference
 from gridreg.fields import make_field
+from gridreg.ops import grid_reference as reference
+from gridreg.ops.rays import use_backend
 from gridreg.rendering import March, OccupancyGrid, Rays, render_rays
-from gridreg.rendering.backends import use_backend
 
 BOX = torch.tensor([[-1.0, -2.0, 0.0], [1.0, 1.0, 3.0]])
 LETTERS = "xyz"

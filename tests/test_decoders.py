@@ -6,8 +6,9 @@ import torch
 from torch.nn.functional import normalize
 
 import gridreg
-from backbones import decoders, kernels
+from backbones import decoders
 from backbones.decoders import MLPDecoder, make_decoder, spherical_harmonics
+from gridreg import ops
 
 
 @pytest.mark.parametrize(
@@ -63,13 +64,13 @@ def test_encoding_sites_cover_the_columns_and_know_their_octaves():
 def test_octaves_that_masks_have_closed_are_left_out(step, precision, monkeypatch):
     """The same colours and gradients as with all octaves and a weight of zeros, at the cost of the open ones."""
     widths = []
-    whole = kernels.encoded_mlp
+    whole = ops.encoded_mlp
 
     def spied(blocks, layers, **options):
         widths.append(layers[0][0].shape[1])
         return whole(blocks, layers, **options)
 
-    monkeypatch.setattr(kernels, "encoded_mlp", spied)
+    monkeypatch.setattr(ops, "encoded_mlp", spied)
     decoder = MLPDecoder(
         4, feature_octaves=2, direction_octaves=3, position_octaves=3, width=16, precision=precision
     )

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor, nn
 
 import gridreg
-from gridreg.attach import slots_of
-from gridreg.finding import find
-from gridreg.sites import raw_tensor
+from gridreg.attach._hooks import slots_of
+from gridreg.attach._resolve import find
+from gridreg.attach.sites import raw_tensor
 from tests.fields import DESIGNS, made, points
 from tests.observations import anatomy, same
 
@@ -100,7 +100,7 @@ def spoil(module: nn.Module, attribute: str, place: Any) -> Any:
 
     def spoiled(value: Tensor) -> Tensor:
         chosen = list(place.selected or range(value.shape[-1]))
-        ranks = gridreg.masks.channel_ranks(octaves or tuple(range(len(chosen))))
+        ranks = gridreg.regularizers.mask_functions.channel_ranks(octaves or tuple(range(len(chosen))))
         closed = [c for c, rank in zip(chosen, ranks, strict=True) if rank >= (max(ranks) + 1) // 2]
         value = value.clone()
         value[..., closed] = float("nan")

@@ -18,11 +18,12 @@ import yaml
 
 import gridreg
 from backbones.decoders import DECODERS
-from gridreg import compositions, finding
 from gridreg import fields as field_registry
+from gridreg.attach import _resolve as finding
 from gridreg.base import REGISTRY
 from gridreg.cli import COMMANDS
 from gridreg.cli.main import options_of
+from gridreg.compositions import named as compositions
 from gridreg.scenes.protocols import PROTOCOLS, Listed
 from gridreg.schedules import SCHEDULES
 from gridreg.training import RunConfig, TrainOptions, preset_names

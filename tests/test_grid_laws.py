@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from torch import Tensor, nn
 
 import gridreg
+from gridreg.attach.sites import Grid, Place
 from gridreg.base import REGISTRY, Clock, Context, Regularizer
-from gridreg.sites import Grid, Place
 
 CHANNELS = 3
 

@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.autograd import gradcheck
 
+from gridreg.attach.sites import Grid, parameters
 from gridreg.base import Clock, Context, LocalTerm
 from gridreg.errors import InputError
-from gridreg.grid_penalties import L1, Orthogonality, TotalVariation, l1, orthogonality, total_variation
-from gridreg.sites import Grid, parameters
+from gridreg.regularizers.grids import L1, Orthogonality, TotalVariation, l1, orthogonality, total_variation
 from tests import oracles
 
 CONTEXT = Context(Clock(100, seed=0))

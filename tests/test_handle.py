@@ -11,8 +11,8 @@ import torch
 from torch import Tensor, nn
 
 import gridreg
+from gridreg.attach.sites import SiteLike
 from gridreg.base import Context, Regularizer
-from gridreg.sites import SiteLike
 from tests.fields import made, points
 from tests.observations import same, samples_of
 

@@ -9,11 +9,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from backbones.kernels import adam, adam_update
-from backbones.kernels.adam import FusedAdam
-from backbones.kernels.adam_layout import Layout, layout
 from gridreg.base import LocalTerm
-from gridreg.rendering.backends import use_backend
+from gridreg.ops.cpu.adam import optimizer as adam
+from gridreg.ops.cpu.adam import update as adam_update
+from gridreg.ops.cpu.adam.layout import Layout, layout
+from gridreg.ops.cpu.adam.optimizer import FusedAdam
+from gridreg.ops.rays import use_backend
 
 BETAS = (0.9, 0.99)
 

@@ -8,9 +8,9 @@ import math
 import pytest
 import torch
 
-from backbones.kernels.adam import FusedAdam
 from gridreg.base import LocalTerm
 from gridreg.errors import InputError
+from gridreg.ops.cpu.adam.optimizer import FusedAdam
 
 BETAS = (0.9, 0.99)
 

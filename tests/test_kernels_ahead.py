@@ -10,15 +10,16 @@ import textwrap
 
 import pytest
 
-from backbones.kernels import ahead, cache
-from backbones.kernels.compiler import Kernel
 from gridreg.cores import usable_cores
+from gridreg.ops.cpu.jit import cache
+from gridreg.ops.cpu.jit import precompile as ahead
+from gridreg.ops.cpu.jit.compiler import Kernel
 
 
 @pytest.mark.parametrize("name", ahead._ORDER)
 def test_what_it_names_is_a_kernel(name):
     module, _, function = name.partition(".")
-    found = getattr(importlib.import_module(f"backbones.kernels.{module}"), function)
+    found = getattr(importlib.import_module(f"gridreg.ops.{module}"), function)
     assert isinstance(found, Kernel)
     assert found.name == name
 
@@ -40,7 +41,8 @@ def test_it_compiles_until_it_meets_the_other_process(tmp_path):
     compiled = in_fresh_cache(
         tmp_path,
         """
-        from backbones.kernels import ahead, sums
+        from gridreg.ops.cpu.jit import precompile as ahead
+        from gridreg.ops.cpu import reductions as sums
         sums._thin.address
         ahead._ORDER = ("sums._measure", "composite._seen", "sums._thin", "sums._fold")
         ahead.main()
@@ -59,8 +61,8 @@ def test_an_empty_cache_starts_it(tmp_path):
         tmp_path,
         """
         import time
-        from backbones.kernels import sums
-        from backbones.kernels.encode import _forward
+        from gridreg.ops.cpu import reductions as sums
+        from gridreg.ops.encode import _forward
         sums._measure.address
         # Of the second process; this one has no use for it.
         end = time.monotonic() + 100

@@ -10,8 +10,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from backbones.kernels import composite
-from gridreg.rendering import backends, choice, plain
+from gridreg.ops import dispatch as choice
+from gridreg.ops import ray_reference as plain
+from gridreg.ops import rays as backends
+from gridreg.ops.cpu import composite
 
 counts_lists = st.lists(st.sampled_from([0, 0, 1, 2, 7, 40]), max_size=150)
 

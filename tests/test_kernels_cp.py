@@ -8,10 +8,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from backbones import kernels
-from backbones.kernels import reference
+from gridreg import ops
 from gridreg.errors import InputError
-from gridreg.rendering.backends import use_backend
+from gridreg.ops import grid_reference as reference
+from gridreg.ops.rays import use_backend
 from tests.kernel_grids import (
     LINE_AXES,
     assert_same,
@@ -25,7 +25,7 @@ from tests.kernel_grids import (
     threads,
 )
 
-FUNCTIONS = [kernels.cp_density, kernels.cp_features]
+FUNCTIONS = [ops.cp_density, ops.cp_features]
 
 
 def fixed(function, u, open_channels=None):
@@ -61,7 +61,7 @@ def test_closed_channels(function, seed, shape, count, opened):
     assert_same(fixed(function, u, opened), lines)
     out, gradients = evaluate("compiled", fixed(function, u, opened), lines)
     assert all(bool((x[:, opened:] == 0).all()) for x in gradients)
-    if function is kernels.cp_features:
+    if function is ops.cp_features:
         assert bool((out[:, opened:] == 0).all())
 
 

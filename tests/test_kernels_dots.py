@@ -9,8 +9,10 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.nn import functional as F
 
-from backbones.kernels import dots, mlp, register_blocks
-from backbones.kernels.dots import multiply, pack, weight_gradient
+from gridreg.ops import mlp
+from gridreg.ops.cpu.mlp import dots
+from gridreg.ops.cpu.mlp import gemm_tile as register_blocks
+from gridreg.ops.cpu.mlp.dots import multiply, pack, weight_gradient
 
 native = pytest.mark.skipif(not dots.available(), reason="the processor has no dot products of bfloat16")
 

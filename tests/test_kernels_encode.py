@@ -9,10 +9,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from backbones.kernels.encode import encode, encode_together
 from gridreg.encodings import positional_encoding
 from gridreg.errors import InputError
-from gridreg.rendering.backends import use_backend
+from gridreg.ops.encode import encode, encode_together
+from gridreg.ops.rays import use_backend
 
 
 def draw(rows: int, dims: int, seed: int, spread: float = 2.0) -> torch.Tensor:
@@ -91,7 +91,7 @@ def test_plain_path():
 
 def test_which_path(monkeypatch):
     # Its package exports a function of the same name.
-    module = importlib.import_module("backbones.kernels.encode")
+    module = importlib.import_module("gridreg.ops.encode")
     calls = []
     launch = module.launch
     monkeypatch.setattr(module, "launch", lambda *a: (calls.append(a[0]), launch(*a)))

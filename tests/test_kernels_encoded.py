@@ -10,16 +10,16 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from backbones.kernels import Block, encoded_mlp
-from backbones.kernels.bfloat16 import load_low, store_low
-from backbones.kernels.chain import CHUNK, CHUNK_TAIL, padded_rows
-from backbones.kernels.compiler import float32, kernel, next_task, uint16, vector
-from backbones.kernels.linear import Layer
-from backbones.kernels.simd import LANES, load, one, store, wide
-from backbones.kernels.threading import launch
 from gridreg.encodings import positional_encoding
 from gridreg.errors import InputError
-from gridreg.rendering.backends import use_backend
+from gridreg.ops import Block, encoded_mlp
+from gridreg.ops.cpu.jit.bfloat16 import load_low, store_low
+from gridreg.ops.cpu.jit.compiler import float32, kernel, next_task, uint16, vector
+from gridreg.ops.cpu.jit.launch import launch
+from gridreg.ops.cpu.jit.simd import LANES, load, one, store, wide
+from gridreg.ops.cpu.mlp.chain import CHUNK, CHUNK_TAIL, padded_rows
+from gridreg.ops.linear import Layer
+from gridreg.ops.rays import use_backend
 
 
 def draw(*shape, seed=0, scale=1.0):

@@ -9,10 +9,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from backbones.kernels import linear
-from backbones.kernels.linear import Layer, bfloat16_is_fast, mlp
 from gridreg.errors import InputError
-from gridreg.rendering.backends import use_backend
+from gridreg.ops import linear
+from gridreg.ops.linear import Layer, bfloat16_is_fast, mlp
+from gridreg.ops.rays import use_backend
 
 
 def draw(*shape: int, seed: int = 0) -> torch.Tensor:

@@ -9,9 +9,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from backbones.kernels.march import march
 from gridreg.errors import InputError
-from gridreg.rendering import plain
+from gridreg.ops import ray_reference as plain
+from gridreg.ops.cpu.march import march
 
 BOUNDS = torch.tensor([[-1.0, -0.5, 0.0], [1.0, 1.5, 1.0]])
 

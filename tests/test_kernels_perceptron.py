@@ -15,14 +15,17 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from backbones.kernels import Block, dot_blocks, encoded, encoded_mlp, fma_blocks
-from backbones.kernels.compiler import float32, kernel, next_task, uint16, vector
-from backbones.kernels.dot_blocks import HIGH, lower
-from backbones.kernels.linear import Layer
-from backbones.kernels.perceptron import fits, rows_of
-from backbones.kernels.register_blocks import SUMMED, TASKS
-from backbones.kernels.simd import LANES, load, wide
-from backbones.kernels.threading import launch
+from gridreg.ops import Block, encoded_mlp
+from gridreg.ops import encoded_mlp as encoded
+from gridreg.ops.cpu.jit.compiler import float32, kernel, next_task, uint16, vector
+from gridreg.ops.cpu.jit.launch import launch
+from gridreg.ops.cpu.jit.simd import LANES, load, wide
+from gridreg.ops.cpu.mlp import gemm_bf16 as dot_blocks
+from gridreg.ops.cpu.mlp import gemm_f32 as fma_blocks
+from gridreg.ops.cpu.mlp.fused import fits, rows_of
+from gridreg.ops.cpu.mlp.gemm_bf16 import HIGH, lower
+from gridreg.ops.cpu.mlp.gemm_tile import SUMMED, TASKS
+from gridreg.ops.linear import Layer
 
 native = pytest.mark.skipif(
     not dot_blocks.available(), reason="the processor has no dot products of bfloat16"
@@ -172,8 +175,9 @@ def test_blocks_for_fewer_registers_give_the_same(tmp_path):
     """As on a processor with 16 registers of 8 float32: smaller blocks of results, compiled in a process of its own."""
     text = """
         import torch
-        from backbones.kernels import Block, encoded_mlp, fma_blocks
-        from backbones.kernels.linear import Layer
+        from gridreg.ops import Block, encoded_mlp
+        from gridreg.ops.cpu.mlp import gemm_f32 as fma_blocks
+        from gridreg.ops.linear import Layer
 
         def draw(*shape, seed=0):
             return torch.randn(shape, generator=torch.Generator().manual_seed(seed))

@@ -7,7 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from backbones.kernels.sums import fold, thin
+from gridreg.ops.cpu.reductions import fold, thin
 from tests.kernel_grids import threads
 
 

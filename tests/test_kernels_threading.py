@@ -11,8 +11,9 @@ import pytest
 import torch
 from numba.core import caching
 
-from backbones.kernels import cache, threading
-from backbones.kernels.compiler import (
+from gridreg.ops.cpu.jit import cache
+from gridreg.ops.cpu.jit import launch as threading
+from gridreg.ops.cpu.jit.compiler import (
     cube,
     float32,
     int64,
@@ -26,9 +27,9 @@ from backbones.kernels.compiler import (
     uint8,
     vector,
 )
-from backbones.kernels.simd import LANES, add_to, load, one, prefetch, store, total, wide
-from backbones.kernels.threading import launch
-from backbones.kernels.workspace import room
+from gridreg.ops.cpu.jit.launch import launch
+from gridreg.ops.cpu.jit.simd import LANES, add_to, load, one, prefetch, store, total, wide
+from gridreg.ops.cpu.jit.workspace import room
 from tests.kernel_grids import threads
 
 
@@ -192,7 +193,7 @@ def run_script(text):
 
 PRELUDE = """
     import threading, torch
-    from backbones import kernels
+    from gridreg import ops
     torch.set_num_threads(2)
 
     def work(seed):
@@ -200,7 +201,7 @@ PRELUDE = """
         planes = [torch.randn(30, 30, 16, generator=g, requires_grad=True) for _ in range(3)]
         lines = [torch.randn(30, 16, generator=g, requires_grad=True) for _ in range(3)]
         u = torch.rand(4000, 3, generator=g)
-        out = kernels.vm_density(u, planes, lines)
+        out = ops.vm_density(u, planes, lines)
         out.square().sum().backward()
         return [out.detach(), *(x.grad for x in (*planes, *lines))]
 """
@@ -239,12 +240,12 @@ def test_forked_process():
     child = os.fork()
     if child == 0:
         torch.set_num_threads(1)
-        from backbones.kernels import autograd
-        import backbones.kernels.threading as team
+        from gridreg.ops.cpu import autograd
+        import gridreg.ops.cpu.jit.launch as team
         assert team._state["forked"]
         torch.set_num_threads(2)
         served = torch.zeros(500, dtype=torch.int64)
-        from backbones.kernels.rows import list_by_row
+        from gridreg.ops.cpu.counting_sort import list_by_row
         u = torch.rand(3000, 3)
         list_by_row(u, torch.ones(3000), (5, 5, 5), 2)
         os._exit(7)

@@ -10,10 +10,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from backbones import kernels
-from backbones.kernels import autograd, reference
+from gridreg import ops
 from gridreg.errors import InputError
-from gridreg.rendering.backends import use_backend
+from gridreg.ops import grid_reference as reference
+from gridreg.ops.cpu import autograd
+from gridreg.ops.rays import use_backend
 from tests.kernel_grids import (
     LINE_AXES,
     PLANE_AXES,
@@ -30,7 +31,7 @@ from tests.kernel_grids import (
     threads,
 )
 
-FUNCTIONS = [kernels.vm_density, kernels.vm_features]
+FUNCTIONS = [ops.vm_density, ops.vm_features]
 
 
 def numpy_products(u, planes, lines):
@@ -76,7 +77,7 @@ def test_closed_channels(function, seed, shape, count, opened):
     cut = [x[..., :opened].clone() for x in (*planes, *lines)]
     if 0 < opened < count:
         full, gradients = evaluate("compiled", split(function, u, opened), [*planes, *lines])
-        if function is kernels.vm_density:
+        if function is ops.vm_density:
             terms = function(u, [x.abs() for x in cut[:3]], [x.abs() for x in cut[3:]])
             close(full, function(u, cut[:3], cut[3:]), 1e-5, terms)
         else:
@@ -107,13 +108,13 @@ def test_gradcheck(function):
 def test_gradient_of_positions_takes_the_plain_path():
     planes, lines = make_grids(5, (4, 5, 6), 8)
     u = torch.rand(9, 3, generator=torch.Generator().manual_seed(0)).requires_grad_()
-    kernels.vm_density(u, planes, lines).sum().backward()
+    ops.vm_density(u, planes, lines).sum().backward()
     low, high = (u.detach() - 1e-3).clamp(0, 1), (u.detach() + 1e-3).clamp(0, 1)
     for axis in range(3):
         a, b = u.detach().clone(), u.detach().clone()
         a[:, axis], b[:, axis] = low[:, axis], high[:, axis]
         with torch.no_grad():
-            slope = (kernels.vm_density(b, planes, lines) - kernels.vm_density(a, planes, lines)) / 2e-3
+            slope = (ops.vm_density(b, planes, lines) - ops.vm_density(a, planes, lines)) / 2e-3
         same_cell = (a[:, axis] * 60).floor() == (b[:, axis] * 60).floor()
         torch.testing.assert_close(u.grad[same_cell, axis], slope[same_cell], rtol=2e-2, atol=2e-2)
 
@@ -156,7 +157,7 @@ def test_many_samples_in_few_rows():
     planes, lines = make_grids(2, (2, 2, 50), 8)
     u = make_positions(2, 4000)
     with threads(2):
-        assert_same(split(kernels.vm_density, u), [*planes, *lines])
+        assert_same(split(ops.vm_density, u), [*planes, *lines])
 
 
 @pytest.mark.parametrize("function", FUNCTIONS)
@@ -196,7 +197,7 @@ def test_accumulating_in_place_gives_the_same_gradients(function):
     leaves[0].grad = torch.ones_like(leaves[0])
     buffer = leaves[0].grad
     mask = torch.full((16,), 1.0, requires_grad=True)
-    with kernels.accumulate_into_grad():
+    with ops.accumulate_into_grad():
         _ = evaluate_on(function, u, leaves, mask)
     assert leaves[0].grad is buffer
     torch.testing.assert_close(leaves[0].grad, expected[0] + 1)
@@ -219,18 +220,18 @@ def evaluate_on(function, u, leaves, mask):
 def test_accumulating_leaves_planes_that_are_no_leaves_to_autograd():
     planes, lines = make_grids(6, (3, 3, 3), 8)
     leaf = planes[0].requires_grad_()
-    with kernels.accumulate_into_grad():
-        kernels.vm_density(make_positions(6, 20), [leaf * 2.0, *planes[1:]], lines).sum().backward()
+    with ops.accumulate_into_grad():
+        ops.vm_density(make_positions(6, 20), [leaf * 2.0, *planes[1:]], lines).sum().backward()
     with use_backend("torch"):
         twin = leaf.detach().clone().requires_grad_()
-        kernels.vm_density(make_positions(6, 20), [twin * 2.0, *planes[1:]], lines).sum().backward()
+        ops.vm_density(make_positions(6, 20), [twin * 2.0, *planes[1:]], lines).sum().backward()
     close(leaf.grad, twin.grad, 1e-5)
 
 
 def test_second_derivatives_are_refused():
     planes, lines = make_grids(6, (3, 3, 3), 8)
     planes[0].requires_grad_()
-    out = kernels.vm_density(make_positions(6, 20), planes, lines).square().sum()
+    out = ops.vm_density(make_positions(6, 20), planes, lines).square().sum()
     (gradient,) = torch.autograd.grad(out, planes[0], create_graph=True)
     with pytest.raises(RuntimeError, match="differentiate twice"):
         gradient.sum().backward()
@@ -239,7 +240,7 @@ def test_second_derivatives_are_refused():
 def test_float64_takes_the_plain_path(monkeypatch):
     planes, lines = make_grids(6, (3, 3, 3), 8, torch.float64)
     monkeypatch.setattr(autograd, "vm_density", None)
-    assert kernels.vm_density(make_positions(6, 5, torch.float64), planes, lines).dtype == torch.float64
+    assert ops.vm_density(make_positions(6, 5, torch.float64), planes, lines).dtype == torch.float64
 
 
 @pytest.mark.parametrize(
@@ -273,7 +274,7 @@ def test_features_in_bfloat16_are_features_rounded(seed, shape, count):
     results = []
     for dtype in (torch.float32, torch.bfloat16):
         grids = [x.clone().requires_grad_() for x in (*planes, *lines)]
-        found = kernels.vm_features(u, grids[:3], grids[3:], None, dtype)
+        found = ops.vm_features(u, grids[:3], grids[3:], None, dtype)
         assert found.dtype == dtype
         results.append([found.detach().float(), *torch.autograd.grad(found, grids, slope.to(dtype))])
     (whole, *gradients), (low, *low_gradients) = results

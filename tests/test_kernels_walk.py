@@ -10,15 +10,15 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from backbones import kernels
-from backbones.kernels import reference
-from backbones.kernels.compiler import float32, kernel, next_task, vector
-from backbones.kernels.simd import LANES, load, one, store, wide
-from backbones.kernels.softplus import softplus
-from backbones.kernels.threading import launch
+from gridreg import ops
 from gridreg.errors import InputError
-from gridreg.rendering import plain
-from gridreg.rendering.backends import use_backend
+from gridreg.ops import grid_reference as reference
+from gridreg.ops import ray_reference as plain
+from gridreg.ops.cpu.jit.compiler import float32, kernel, next_task, vector
+from gridreg.ops.cpu.jit.launch import launch
+from gridreg.ops.cpu.jit.simd import LANES, load, one, store, wide
+from gridreg.ops.cpu.jit.softplus import softplus
+from gridreg.ops.rays import use_backend
 from tests.kernel_grids import close, make_grids, threads
 
 SCALE = 25.0
@@ -33,7 +33,7 @@ def make_scene(seed, rays, step, fill):
     cell_bounds = torch.tensor([[-1.5, -1.5, -1.5], [1.5, 1.5, 1.5]])
     t_min, t_max = torch.full((rays,), 1.0), torch.rand(rays, generator=g) * 4 + 1
     bounds = torch.tensor([[-1.5, -1.2, -1.5], [1.4, 1.5, 1.5]])
-    march = kernels.March(
+    march = ops.March(
         origins, directions, t_min, t_max, step, cells, cell_bounds, torch.rand(rays, generator=g)
     )
     return march, bounds
@@ -44,9 +44,9 @@ def run(backend, march, activation, bound, planes, lines, opened=None):
     leaves = [x.clone().requires_grad_() for x in (*planes, *lines)]
     with use_backend(backend):
         if planes:
-            found = kernels.vm_march_density(march, activation, bound, leaves[:3], leaves[3:], opened)
+            found = ops.vm_march_density(march, activation, bound, leaves[:3], leaves[3:], opened)
         else:
-            found = kernels.cp_march_density(march, activation, bound, leaves, opened)
+            found = ops.cp_march_density(march, activation, bound, leaves, opened)
         upstream = torch.randn(found[4].shape, generator=torch.Generator().manual_seed(0))
         found[4].backward(upstream)
     return [x.detach() for x in found], [x.grad for x in leaves]
@@ -75,7 +75,7 @@ def test_same_samples_and_gradients(planar, seed, rays, count, shift, bound, fil
     march, bounds = make_scene(seed, rays, step, fill)
     planes, lines = make_grids(seed, (5, 6, 4), count)
     planes = planes if planar else []
-    activation = kernels.Activation(bounds, shift, SCALE)
+    activation = ops.Activation(bounds, shift, SCALE)
     (offsets, index, t, positions, density), gradients = run(
         "compiled", march, activation, bound, planes, lines
     )
@@ -101,13 +101,11 @@ def test_same_samples_and_gradients(planar, seed, rays, count, shift, bound, fil
 def test_is_the_three_steps(planar):
     march, bounds = make_scene(4, 50, 0.05, 0.5)
     planes, lines = make_grids(4, (9, 8, 7), 16)
-    activation = kernels.Activation(bounds, -3.0, SCALE)
+    activation = ops.Activation(bounds, -3.0, SCALE)
     if planar:
-        offsets, index, t, positions, density = kernels.vm_march_density(
-            march, activation, 1e-2, planes, lines
-        )
+        offsets, index, t, positions, density = ops.vm_march_density(march, activation, 1e-2, planes, lines)
     else:
-        offsets, index, t, positions, density = kernels.cp_march_density(march, activation, 1e-2, lines)
+        offsets, index, t, positions, density = ops.cp_march_density(march, activation, 1e-2, lines)
 
     all_offsets, all_index, all_t, all_positions = plain.march(*march)
     u = (all_positions - bounds[0]) / (bounds[1] - bounds[0])
@@ -129,7 +127,7 @@ def test_is_the_three_steps(planar):
 def test_closed_channels():
     march, bounds = make_scene(9, 20, 0.05, 0.5)
     planes, lines = make_grids(9, (9, 8, 7), 16)
-    activation = kernels.Activation(bounds, -3.0, SCALE)
+    activation = ops.Activation(bounds, -3.0, SCALE)
     found, gradients = run("compiled", march, activation, 0.0, planes, lines, 5)
     expected, expected_gradients = run("torch", march, activation, 0.0, planes, lines, 5)
     close(found[4], expected[4], 1e-5)
@@ -141,7 +139,7 @@ def test_closed_channels():
 def test_same_bits_for_any_number_of_threads():
     march, bounds = make_scene(5, 400, 0.02, 0.6)
     planes, lines = make_grids(5, (30, 31, 32), 16)
-    activation = kernels.Activation(bounds, -4.0, SCALE)
+    activation = ops.Activation(bounds, -4.0, SCALE)
     results = []
     for count in (1, 2, 3):
         with threads(count):
@@ -155,21 +153,21 @@ def test_densities_that_are_not_numbers_stay_visible():
     march, bounds = make_scene(5, 10, 0.1, 1.0)
     planes, lines = make_grids(5, (3, 3, 3), 8)
     planes[0][1, 1, 2] = float("nan")
-    density = kernels.vm_march_density(march, kernels.Activation(bounds, -4.0, SCALE), 1e-3, planes, lines)[4]
+    density = ops.vm_march_density(march, ops.Activation(bounds, -4.0, SCALE), 1e-3, planes, lines)[4]
     assert bool(density.isnan().any())
 
 
 def test_accumulates_in_place():
     march, bounds = make_scene(5, 30, 0.05, 1.0)
     planes, lines = make_grids(5, (6, 5, 4), 8)
-    activation = kernels.Activation(bounds, -4.0, SCALE)
+    activation = ops.Activation(bounds, -4.0, SCALE)
     _, expected = run("compiled", march, activation, 1e-3, planes, lines)
     leaves = [x.requires_grad_() for x in (*planes, *lines)]
     buffers = [torch.zeros_like(x) for x in planes]
     for leaf, buffer in zip(leaves[:3], buffers, strict=True):
         leaf.grad = buffer
-    with kernels.accumulate_into_grad():
-        density = kernels.vm_march_density(march, activation, 1e-3, leaves[:3], leaves[3:])[4]
+    with ops.accumulate_into_grad():
+        density = ops.vm_march_density(march, activation, 1e-3, leaves[:3], leaves[3:])[4]
         density.backward(torch.randn(density.shape, generator=torch.Generator().manual_seed(0)))
     assert all(leaf.grad is buffer for leaf, buffer in zip(leaves[:3], buffers, strict=True))
     for leaf, gradient in zip(leaves, expected, strict=True):
@@ -179,18 +177,18 @@ def test_accumulates_in_place():
 def test_bad_input():
     march, bounds = make_scene(5, 3, 0.1, 1.0)
     planes, lines = make_grids(5, (3, 3, 3), 8)
-    good = kernels.Activation(bounds, -4.0, SCALE)
+    good = ops.Activation(bounds, -4.0, SCALE)
     for activation, bound, message in (
         (good, 1.5, "transmittance_bound: found 1.5"),
         (good._replace(scale=0.0), 0.1, "activation.scale: found 0.0"),
         (good._replace(bounds=bounds[0]), 0.1, "activation.bounds: found shape"),
     ):
         with pytest.raises(InputError, match=message):
-            kernels.vm_march_density(march, activation, bound, planes, lines)
+            ops.vm_march_density(march, activation, bound, planes, lines)
         with pytest.raises(InputError, match=message):
-            kernels.cp_march_density(march, activation, bound, lines)
+            ops.cp_march_density(march, activation, bound, lines)
     with pytest.raises(InputError, match="step: found -1"):
-        kernels.cp_march_density(march._replace(step=-1.0), good, 0.1, lines)
+        ops.cp_march_density(march._replace(step=-1.0), good, 0.1, lines)
 
 
 @kernel

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from backbones.kernels.compiler import float32, kernel, next_task, vector
-from backbones.kernels.simd import LANES, load, one, store, wide
-from backbones.kernels.threading import launch
-from backbones.kernels.waves import sine_and_cosine
+from gridreg.ops.cpu.jit.compiler import float32, kernel, next_task, vector
+from gridreg.ops.cpu.jit.launch import launch
+from gridreg.ops.cpu.jit.simd import LANES, load, one, store, wide
+from gridreg.ops.cpu.jit.sincos import sine_and_cosine
 
 
 @kernel

@@ -16,8 +16,8 @@ from torch.autograd import gradcheck
 import gridreg
 from gridreg.base import Clock, Context
 from gridreg.errors import InputError
-from gridreg.filters import fourier_low_pass, gaussian_blur, low_pass_response
-from gridreg.lowpass import FourierLowPass, SpatialAnnealing, annealed_radius
+from gridreg.regularizers.filters import fourier_low_pass, gaussian_blur, low_pass_response
+from gridreg.regularizers.low_pass import FourierLowPass, SpatialAnnealing, annealed_radius
 from gridreg.schedules import Linear
 from tests import oracles
 

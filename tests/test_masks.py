@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import gridreg
+from gridreg.attach.sites import Place
 from gridreg.base import Clock, Context
-from gridreg.masks import channel_ranks, level_mask, spherical_bands
-from gridreg.sites import Place
+from gridreg.regularizers.mask_functions import channel_ranks, level_mask, spherical_bands
 
 COUNTS = st.integers(1, 40)
 TOTALS = st.integers(1, 500)

@@ -10,7 +10,7 @@ from torch import nn
 
 import gridreg
 from gridreg.errors import InputError
-from gridreg.optimization import LearningRate, WeightDecay, split_groups
+from gridreg.regularizers.optimizer import LearningRate, WeightDecay, split_groups
 from gridreg.schedules import Linear
 
 LINES = gridreg.parameters("line", dim=0)

@@ -14,7 +14,7 @@ from torch.autograd import gradcheck
 
 from gridreg.base import Clock, Context
 from gridreg.errors import InputError
-from gridreg.penalties import CauchySparsity, OcclusionLoss, cauchy_sparsity, occlusion_loss
+from gridreg.regularizers.density import CauchySparsity, OcclusionLoss, cauchy_sparsity, occlusion_loss
 from gridreg.samples import RaySamples
 from gridreg.schedules import Linear
 from tests import oracles

@@ -7,9 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
-import backbones.kernels  # noqa: F401  (registers the compiled pools)
-from gridreg.rendering import March, OccupancyGrid, Rays, backends, render, render_rays
-from gridreg.rendering.pooling import pool_faint
+import gridreg.ops  # noqa: F401  (registers the compiled pools)
+from gridreg.ops import rays as backends
+from gridreg.ops.pooling import pool_faint
+from gridreg.rendering import March, OccupancyGrid, Rays, render, render_rays
 
 
 def seeded(seed: int = 0) -> torch.Generator:

@@ -16,8 +16,8 @@ from torch.autograd import gradcheck
 
 from gridreg.base import Clock, Context, Regularizer
 from gridreg.errors import InputError
-from gridreg.patch_penalties import DepthSmoothness, RayKL, depth_smoothness, ray_kl
-from gridreg.ray_penalties import (
+from gridreg.regularizers.patches import DepthSmoothness, RayKL, depth_smoothness, ray_kl
+from gridreg.regularizers.rays import (
     Distortion,
     OpacityEntropy,
     RayEntropy,

@@ -13,9 +13,7 @@ from torch import Tensor
 
 from gridreg.base import Clock, Context
 from gridreg.errors import InputError
-from gridreg.gradient_scaling import DistanceGradientScaling, scale_gradients_by_distance
-from gridreg.samples import RaySamples
-from gridreg.sampling import (
+from gridreg.regularizers.backgrounds import (
     ExpectedBackground,
     RandomBackground,
     SpaceAnnealing,
@@ -23,6 +21,8 @@ from gridreg.sampling import (
     opacity_error,
     random_background,
 )
+from gridreg.regularizers.gradient_scaling import DistanceGradientScaling, scale_gradients_by_distance
+from gridreg.samples import RaySamples
 from tests.oracles import make_batch
 
 

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor, nn
 
 import gridreg
-from gridreg.finding import find
-from gridreg.sites import Match, Selector, Site
+from gridreg.attach._resolve import find
+from gridreg.attach.sites import Match, Selector, Site
 
 
 class Block(nn.Module):
@@ -221,7 +221,7 @@ class OddlyNamed(Foreign):
 
 @pytest.fixture
 def adapter() -> Any:
-    from gridreg import finding
+    from gridreg.attach import _resolve as finding
 
     gridreg.register_adapter(Foreign, lambda field: {"grid": gridreg.parameters("grid", dim=1)})
     yield

@@ -8,8 +8,8 @@ from torch.nn import functional as F
 
 import gridreg
 from backbones.vm import VMField
+from gridreg.ops.rays import use_backend
 from gridreg.rendering import March, OccupancyGrid, Rays, render_rays
-from gridreg.rendering.backends import use_backend
 
 BOX = torch.tensor([[-1.0, -2.0, 0.0], [1.0, 1.0, 3.0]])
 

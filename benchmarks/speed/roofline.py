@@ -9,12 +9,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from backbones.kernels import autograd
-from backbones.kernels.linear import product_dtype
-from backbones.kernels.sums import thin
 from backbones.vm import LINE_AXES, PLANE_AXES
-from gridreg.attach import open_channels
+from gridreg.attach._hooks import open_channels
 from gridreg.errors import InputError
+from gridreg.ops.cpu import autograd
+from gridreg.ops.cpu.reductions import thin
+from gridreg.ops.linear import product_dtype
 
 from . import common, machine, step
 from .common import Record

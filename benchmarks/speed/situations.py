@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from gridreg.errors import InputError
+from gridreg.ops.rays import use_backend
 from gridreg.rendering import OccupancyGrid, Rays
-from gridreg.rendering.backends import use_backend
 from gridreg.scenes import Scene
 from gridreg.training import RunConfig, Trainer, build_trainer, events, load_preset, load_run, regularizers_of
 

@@ -12,9 +12,14 @@ from typing import Any, NamedTuple
 import torch
 
 import gridreg.training.trainer as trainer_module
-from backbones import kernels
-from backbones.kernels import autograd, cp, encoded, linear, perceptron, vm_gradient
-from gridreg.rendering import backends, plain, render
+from gridreg import ops
+from gridreg.ops import encoded_mlp as encoded
+from gridreg.ops import linear
+from gridreg.ops import ray_reference as plain
+from gridreg.ops import rays as backends
+from gridreg.ops.cpu import autograd, cp, vm_gradient
+from gridreg.ops.cpu.mlp import fused as perceptron
+from gridreg.rendering import render
 from gridreg.training import Trainer
 
 #: In the order of an iteration. What no stage accounts for is ``rest``: the loss, learning rates, the report.
@@ -114,8 +119,8 @@ def places_of(trainer: Trainer) -> list[Place]:
         Place(autograd, "mark", "march"),
         Place(field, _first(field, "march_density", "density"), "density"),
         Place(field, _first(field, "colour_of_rays", "colour"), "colour/network"),
-        Place(kernels, "vm_features", "colour/lookup"),
-        Place(kernels, "cp_features", "colour/lookup"),
+        Place(ops, "vm_features", "colour/lookup"),
+        Place(ops, "cp_features", "colour/lookup"),
         # All of the rendering that is neither of the above: weights, sums along rays, packing.
         Place(trainer_module, "render_rays", "compositing"),
         Place(torch.Tensor, "backward", "backward/other"),

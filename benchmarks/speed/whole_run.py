@@ -15,9 +15,9 @@ from typing import Any
 
 import torch
 
-from backbones.kernels.compiler import Kernel
 from gridreg.errors import InputError
-from gridreg.rendering.backends import use_backend
+from gridreg.ops.cpu.jit.compiler import Kernel
+from gridreg.ops.rays import use_backend
 from gridreg.training import Execution, StepReport, TrainSettings, execute
 from gridreg.training.files import write_json
 

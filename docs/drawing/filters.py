@@ -8,8 +8,8 @@ from torch import Tensor, nn
 
 import gridreg
 from drawing.svg import Panel
-from gridreg.filters import low_pass_response
-from gridreg.lowpass import annealed_radius
+from gridreg.regularizers.filters import low_pass_response
+from gridreg.regularizers.low_pass import annealed_radius
 
 NODES = 64
 

@@ -8,8 +8,8 @@ from fnmatch import fnmatchcase
 from typing import Any
 
 from gridreg.base import REGISTRY
-from gridreg.compose import from_config, to_config
-from gridreg.compositions import composition, composition_names
+from gridreg.compositions.named import composition, composition_names
+from gridreg.compositions.plain_data import from_config, to_config
 from gridreg.errors import InputError
 from gridreg.training.presets import load_preset, preset_names
 

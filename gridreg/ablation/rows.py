@@ -35,8 +35,8 @@ from gridreg.ablation.edits import (
     replaced,
     title_of,
 )
-from gridreg.compose import to_config
-from gridreg.compositions import composition as named_composition
+from gridreg.compositions.named import composition as named_composition
+from gridreg.compositions.plain_data import to_config
 from gridreg.errors import InputError
 
 __all__ = ["Row", "expand_rows"]

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from gridreg.rendering import backends
+from gridreg.ops import rays as backends
 from gridreg.rendering.occupancy import OccupancyGrid
 from gridreg.rendering.rays import Rays, box_intersection, camera_rays
 from gridreg.samples import RaySamples
@@ -58,7 +58,7 @@ class March:
             changes by at most this much. 0 keeps them all.
         weight_bound: colour is evaluated only where the weight exceeds this (TensoRF uses 1e-4).
         pool_weight: neighbours on a ray that weigh less than this share the colour of one of them, see
-            `gridreg.rendering.pooling`. 0: every sample has its own.
+            `gridreg.ops.pooling`. 0: every sample has its own.
     """
 
     step: float

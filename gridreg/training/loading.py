@@ -10,9 +10,9 @@ from typing import Any
 import torch
 
 import gridreg
+from gridreg.attach.handle import Handle
 from gridreg.errors import InputError
 from gridreg.fields import make_field
-from gridreg.handle import Handle
 from gridreg.rendering import Ensemble, March, OccupancyGrid
 from gridreg.training import events
 from gridreg.training.checkpoint import has_checkpoint, load_checkpoint

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from gridreg.errors import InputError
-from gridreg.rendering import OccupancyGrid, Rays, backends, box_intersection, pixel_rays
+from gridreg.ops import rays as backends
+from gridreg.rendering import OccupancyGrid, Rays, box_intersection, pixel_rays
 from gridreg.scenes import Scene, Views, ndc_rays
 
 __all__ = ["NdcWarp", "RayBank", "meets", "warp_of"]

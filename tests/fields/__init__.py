@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 import gridreg
-from gridreg.sites import SiteLike
+from gridreg.attach.sites import SiteLike
 from tests.fields.coordinate_mlp import NerfMLP
 from tests.fields.hash_grid import InstantField
 from tests.fields.kplanes import KPlanesField

@@ -1,0 +1,1 @@
+"""Attach regularizers to a field from the outside, and take them off again."""

@@ -1,0 +1,55 @@
+"""Attach regularizers to a field."""
+
+from __future__ import annotations
+
+from torch import nn
+
+from gridreg.attach._binding import Attachment
+from gridreg.attach.handle import Handle
+from gridreg.base import Clock, Regularizer
+from gridreg.errors import InputError
+
+__all__ = ["apply"]
+
+
+def apply(field: nn.Module, *regularizers: Regularizer, total_steps: int, seed: int = 0) -> Handle:
+    """Attach regularizers to a field, which is neither edited nor copied.
+
+    Args:
+        field: any module.
+        regularizers: in this order; two masks on one site multiply.
+        total_steps: length of the training run, iterations; fractions in schedules refer to it.
+        seed: of the handle's own random numbers.
+
+    Returns:
+        The handle, at step 0.
+
+    Raises:
+        InputError: naming the argument, what was found and what is expected.
+
+    >>> import gridreg, torch
+    >>> mlp = nn.Sequential(nn.Linear(6, 8), nn.ReLU(), nn.Linear(8, 1))
+    >>> with gridreg.apply(mlp, gridreg.FrequencyMask(gridreg.inputs("0")), total_steps=100):
+    ...     bool((mlp(torch.tensor([0.0, 0, 0, 1, 1, 1])) == mlp(torch.zeros(6))).all())
+    True
+    """
+    if not isinstance(field, nn.Module):
+        raise InputError(f"field={type(field).__name__}: expected a torch.nn.Module")
+    for regularizer in regularizers:
+        _check_regularizer(regularizer)
+    if isinstance(total_steps, bool) or not hasattr(total_steps, "__index__") or total_steps <= 0:
+        raise InputError(
+            f"total_steps={total_steps!r}: expected the number of training steps, an int above 0"
+        )
+    return Handle(Attachment(field, regularizers, Clock(int(total_steps), seed)))
+
+
+def _check_regularizer(value: object) -> None:
+    if isinstance(value, Handle):
+        raise InputError("regularizers: found a handle, which is applied already; pass regularizers to apply")
+    if not isinstance(value, Regularizer):
+        hint = "; unpack a list with *" if isinstance(value, (list, tuple)) else ""
+        if isinstance(value, type) and issubclass(value, Regularizer):
+            hint = f"; call it: {value.__name__}(...)"
+        name = getattr(value, "__name__", None) or repr(value)[:60]
+        raise InputError(f"regularizers: found {name}, expected instances of gridreg.Regularizer{hint}")

@@ -1,0 +1,1 @@
+"""Compositions of regularizers: by name, and to plain data and back."""

@@ -1,0 +1,1 @@
+"""Compiled versions of the operations for the CPU."""

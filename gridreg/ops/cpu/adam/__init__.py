@@ -1,0 +1,1 @@
+"""Adam for grids: one pass over parameters, moments and penalties."""

@@ -1,0 +1,293 @@
+"""Compiled compositing along rays: weights, weighted sums and early termination, with their gradients."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd import Function
+from torch.autograd.function import once_differentiable
+
+from gridreg.ops import ray_reference as plain
+from gridreg.ops.cpu.jit.compiler import (
+    float32,
+    int64,
+    integer,
+    kernel,
+    matrix,
+    next_task,
+    real,
+    uint8,
+    vector,
+)
+from gridreg.ops.cpu.jit.launch import launch
+from gridreg.ops.cpu.march import march
+from gridreg.ops.cpu.pooling import pool, spread
+from gridreg.ops.rays import Backend, register_backend
+
+__all__ = ["accumulate", "composite_weights", "pixels", "register", "terminate"]
+
+# Rays of one task.
+_RAYS = 64
+
+
+def _tasks(offsets: Tensor) -> int:
+    return -(-(offsets.numel() - 1) // _RAYS)
+
+
+@kernel
+def _weights_forward(table: Any) -> None:
+    """``w_n = T_n alpha_n`` and ``T_{n+1}``, from ``alpha`` and ``exp(-tau)``."""
+    offsets, alpha, through = vector(table, 0, int64), vector(table, 1, float32), vector(table, 2, float32)
+    weights, after = vector(table, 3, float32), vector(table, 4, float32)
+    rays, samples = offsets.shape[0] - 1, alpha.shape[0]
+    while True:
+        task = next_task(table)
+        if task < 0:
+            break
+        for ray in range(task * _RAYS, min((task + 1) * _RAYS, rays)):
+            transmittance = float32(1)
+            for n in range(max(offsets[ray], 0), min(offsets[ray + 1], samples)):
+                weights[n] = transmittance * alpha[n]
+                transmittance *= through[n]
+                after[n] = transmittance
+
+
+@kernel
+def _weights_backward(table: Any) -> None:
+    """``dL/dtau_n = g_n T_{n+1} - sum_{m > n} g_m w_m``."""
+    offsets, weights, after = vector(table, 0, int64), vector(table, 1, float32), vector(table, 2, float32)
+    gradient, result = vector(table, 3, float32), vector(table, 4, float32)
+    rays, samples = offsets.shape[0] - 1, weights.shape[0]
+    while True:
+        task = next_task(table)
+        if task < 0:
+            break
+        for ray in range(task * _RAYS, min((task + 1) * _RAYS, rays)):
+            behind = 0.0
+            first, end = max(offsets[ray], 0), min(offsets[ray + 1], samples)
+            for back in range(end - first):
+                n = end - 1 - back
+                result[n] = float32(gradient[n] * after[n] - behind)
+                behind += gradient[n] * weights[n]
+
+
+class _Weights(Function):
+    @staticmethod
+    def forward(ctx: Any, optical_depth: Tensor, offsets: Tensor) -> Tensor:
+        negative = optical_depth.neg().contiguous()
+        alpha = torch.expm1(negative).neg_()
+        weights, after = torch.empty_like(alpha), torch.empty_like(alpha)
+        launch(_weights_forward, _tasks(offsets), offsets, alpha, negative.exp_(), weights, after)
+        ctx.save_for_backward(offsets, weights, after)
+        return weights
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        offsets, weights, after = ctx.saved_tensors
+        result = torch.empty_like(weights)
+        launch(_weights_backward, _tasks(offsets), offsets, weights, after, gradient.contiguous(), result)
+        return result, None
+
+
+@kernel
+def _sums_forward(table: Any) -> None:
+    """``sum_n w_n v_n`` of every ray."""
+    offsets, weights = vector(table, 0, int64), vector(table, 1, float32)
+    values, sums = matrix(table, 2, float32), matrix(table, 3, float32)
+    rays, samples, channels = offsets.shape[0] - 1, weights.shape[0], values.shape[1]
+    while True:
+        task = next_task(table)
+        if task < 0:
+            break
+        for ray in range(task * _RAYS, min((task + 1) * _RAYS, rays)):
+            total = sums[ray]
+            for k in range(channels):
+                total[k] = float32(0)
+            for n in range(max(offsets[ray], 0), min(offsets[ray + 1], samples)):
+                for k in range(channels):
+                    total[k] += weights[n] * values[n, k]
+
+
+@kernel
+def _sums_backward(table: Any) -> None:
+    """Gradients with respect to the weights and, where wanted, the values."""
+    offsets, weights = vector(table, 0, int64), vector(table, 1, float32)
+    values, gradient = matrix(table, 2, float32), matrix(table, 3, float32)
+    of_weights, of_values = vector(table, 4, float32), matrix(table, 5, float32)
+    want_weights, want_values = integer(table, 6), integer(table, 7)
+    rays, samples, channels = offsets.shape[0] - 1, weights.shape[0], values.shape[1]
+    while True:
+        task = next_task(table)
+        if task < 0:
+            break
+        for ray in range(task * _RAYS, min((task + 1) * _RAYS, rays)):
+            for n in range(max(offsets[ray], 0), min(offsets[ray + 1], samples)):
+                if want_weights:
+                    total = float32(0)
+                    for k in range(channels):
+                        total += gradient[ray, k] * values[n, k]
+                    of_weights[n] = total
+                if want_values:
+                    for k in range(channels):
+                        of_values[n, k] = weights[n] * gradient[ray, k]
+
+
+class _Sums(Function):
+    @staticmethod
+    def forward(ctx: Any, weights: Tensor, values: Tensor, offsets: Tensor) -> Tensor:
+        weights, values = weights.contiguous(), values.contiguous()
+        sums = torch.empty(offsets.numel() - 1, values.shape[1])
+        launch(_sums_forward, _tasks(offsets), offsets, weights, values, sums)
+        ctx.save_for_backward(offsets, weights, values)
+        return sums
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
+        offsets, weights, values = ctx.saved_tensors
+        want_weights, want_values = ctx.needs_input_grad[:2]
+        of_weights = torch.empty_like(weights) if want_weights else weights
+        of_values = torch.empty_like(values) if want_values else values
+        launch(
+            _sums_backward,
+            _tasks(offsets),
+            offsets,
+            weights,
+            values,
+            gradient.contiguous(),
+            of_weights,
+            of_values,
+            int(want_weights),
+            int(want_values),
+        )
+        return of_weights if want_weights else None, of_values if want_values else None, None
+
+
+@kernel
+def _pixels_forward(table: Any) -> None:
+    """Offsets, weights, colours, distances, background; colour, opacity and depth of every ray."""
+    offsets, weights = vector(table, 0, int64), vector(table, 1, float32)
+    colours, t, background = matrix(table, 2, float32), vector(table, 3, float32), matrix(table, 4, float32)
+    out, opacity, depth = matrix(table, 5, float32), vector(table, 6, float32), vector(table, 7, float32)
+    rays, samples = offsets.shape[0] - 1, weights.shape[0]
+    while True:
+        task = next_task(table)
+        if task < 0:
+            break
+        for ray in range(task * _RAYS, min((task + 1) * _RAYS, rays)):
+            red, green, blue = float32(0), float32(0), float32(0)
+            sum_, far = float32(0), float32(0)
+            for n in range(max(offsets[ray], 0), min(offsets[ray + 1], samples)):
+                weight = weights[n]
+                red += weight * colours[n, 0]
+                green += weight * colours[n, 1]
+                blue += weight * colours[n, 2]
+                sum_ += weight
+                far += weight * t[n]
+            rest = float32(1) - sum_
+            out[ray, 0] = red + rest * background[ray, 0]
+            out[ray, 1] = green + rest * background[ray, 1]
+            out[ray, 2] = blue + rest * background[ray, 2]
+            opacity[ray], depth[ray] = sum_, far
+
+
+@kernel
+def _pixels_backward(table: Any) -> None:
+    """Arguments as of `_pixels_forward`, with gradients for the results; gradients of weights and colours."""
+    offsets, weights = vector(table, 0, int64), vector(table, 1, float32)
+    colours, t, background = matrix(table, 2, float32), vector(table, 3, float32), matrix(table, 4, float32)
+    g, of_opacity, of_depth = matrix(table, 5, float32), vector(table, 6, float32), vector(table, 7, float32)
+    of_weights, of_colours = vector(table, 8, float32), matrix(table, 9, float32)
+    rays, samples = offsets.shape[0] - 1, weights.shape[0]
+    while True:
+        task = next_task(table)
+        if task < 0:
+            break
+        for ray in range(task * _RAYS, min((task + 1) * _RAYS, rays)):
+            red, green, blue = g[ray, 0], g[ray, 1], g[ray, 2]
+            hidden = red * background[ray, 0] + green * background[ray, 1] + blue * background[ray, 2]
+            base, slope = of_opacity[ray] - hidden, of_depth[ray]
+            for n in range(max(offsets[ray], 0), min(offsets[ray + 1], samples)):
+                weight = weights[n]
+                seen = red * colours[n, 0] + green * colours[n, 1] + blue * colours[n, 2]
+                of_weights[n] = seen + base + slope * t[n]
+                of_colours[n, 0] = weight * red
+                of_colours[n, 1] = weight * green
+                of_colours[n, 2] = weight * blue
+
+
+class _Pixels(Function):
+    @staticmethod
+    def forward(
+        ctx: Any, weights: Tensor, colours: Tensor, t: Tensor, background: Tensor, offsets: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        given = tuple(x.contiguous() for x in (offsets, weights, colours, t, background))
+        rays = offsets.numel() - 1
+        out = torch.empty(rays, 3), torch.empty(rays), torch.empty(rays)
+        launch(_pixels_forward, _tasks(offsets), *given, *out)
+        ctx.save_for_backward(*given)
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradient: Tensor) -> tuple[Tensor | None, ...]:
+        given = ctx.saved_tensors
+        of_weights, of_colours = torch.empty_like(given[1]), torch.empty_like(given[2])
+        slopes = (x.contiguous() for x in gradient)
+        launch(_pixels_backward, _tasks(given[0]), *given, *slopes, of_weights, of_colours)
+        return of_weights, of_colours, None, None, None
+
+
+@kernel
+def _seen(table: Any) -> None:
+    """Whether the transmittance before each sample is at least a bound."""
+    offsets, through = vector(table, 0, int64), vector(table, 1, float32)
+    bound, mask = real(table, 2), vector(table, 3, uint8)
+    rays, samples = offsets.shape[0] - 1, through.shape[0]
+    while True:
+        task = next_task(table)
+        if task < 0:
+            break
+        for ray in range(task * _RAYS, min((task + 1) * _RAYS, rays)):
+            transmittance = float32(1)
+            for n in range(max(offsets[ray], 0), min(offsets[ray + 1], samples)):
+                mask[n] = transmittance >= bound
+                transmittance *= through[n]
+
+
+def composite_weights(optical_depth: Tensor, offsets: Tensor) -> Tensor:
+    """See `gridreg.ops.rays.composite_weights`; CPU float32 tensors."""
+    return _Weights.apply(optical_depth, offsets.contiguous())  # type: ignore[no-any-return, no-untyped-call]
+
+
+def accumulate(weights: Tensor, values: Tensor, offsets: Tensor) -> Tensor:
+    """See `gridreg.ops.rays.accumulate`; CPU float32 tensors."""
+    return _Sums.apply(weights, values, offsets.contiguous())  # type: ignore[no-any-return, no-untyped-call]
+
+
+def pixels(
+    weights: Tensor, colours: Tensor, t: Tensor, background: Tensor, offsets: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """See `gridreg.ops.rays.pixels`; CPU float32 tensors."""
+    if t.requires_grad or background.requires_grad:
+        return plain.pixels(weights, colours, t, background, offsets)
+    return _Pixels.apply(weights, colours, t, background, offsets)  # type: ignore[no-any-return, no-untyped-call]
+
+
+@torch.no_grad()
+def terminate(optical_depth: Tensor, offsets: Tensor, bound: float) -> Tensor:
+    """See `gridreg.ops.rays.terminate`; CPU float32 tensors."""
+    mask = torch.empty(optical_depth.shape, dtype=torch.uint8)
+    through = optical_depth.neg().contiguous().exp_()
+    launch(_seen, _tasks(offsets), offsets.contiguous(), through, float(bound), mask)
+    return mask.view(torch.bool)
+
+
+def register() -> None:
+    """Make the compiled march and compositing available to `gridreg.ops.rays`."""
+    register_backend(
+        "compiled", Backend(march, composite_weights, accumulate, terminate, pool, spread, pixels)
+    )

@@ -1,0 +1,1 @@
+"""Compiling and launching kernels: what stands between them and numba."""

@@ -1,0 +1,258 @@
+"""How kernels are compiled, and how they read their arguments.
+
+A kernel is a function of one argument, the table that `gridreg.ops.cpu.jit.launch.launch` fills. It begins by naming
+its arguments by their position and then serves tasks until there are none::
+
+    @kernel
+    def _scale(table):
+        x = vector(table, 0, float32)
+        factor = real(table, 1)
+        while True:
+            task = next_task(table)
+            if task < 0:
+                break
+            ...
+
+Kernels are compiled on their first use and cached on disk. Functions that they call are marked with `inline`. What
+reads the table is generated, not compiled: each function that numba has to compile costs the first run some hundredths
+of a second, and a slice or a new array in a kernel costs several.
+"""
+
+from __future__ import annotations
+
+import functools
+import threading
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from llvmlite import ir  # type: ignore[import-untyped]
+from numba import cfunc, extending, njit, types
+from numba.core.caching import FunctionCache
+from numba.core.errors import NumbaWarning
+from numba.np import arrayobj
+
+from gridreg.ops.cpu.jit.cache import can_lock, forget_outdated, one_process
+
+__all__ = [
+    "Kernel",
+    "cube",
+    "exact",
+    "float32",
+    "inline",
+    "int32",
+    "int64",
+    "integer",
+    "intrinsic",
+    "kernel",
+    "matrix",
+    "next_task",
+    "real",
+    "scratch",
+    "size",
+    "uint16",
+    "uint8",
+    "vector",
+]
+
+float32, int32, int64, uint8, uint16 = np.float32, np.int32, np.int64, np.uint8, np.uint16
+
+# Reordering and contraction make sums fast; not-a-number and infinity keep their meaning, as a run must see them.
+_FAST = {"contract", "nsz", "arcp", "reassoc"}
+_OPTIONS: dict[str, Any] = {"error_model": "numpy", "boundscheck": False}
+# Only kernels are called from outside.
+_HELPER: dict[str, Any] = {**_OPTIONS, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+_TABLE = types.CPointer(types.int64)  # type: ignore[no-untyped-call]
+_WORD = ir.IntType(64)
+_COMPILING = threading.Lock()
+
+# Untyped: a call from a kernel has fewer arguments than the function that generates it.
+intrinsic: Any = extending.intrinsic
+
+
+class Kernel:
+    """A compiled kernel; use it as a decorator, `kernel`.
+
+    Args:
+        function: takes the table, returns nothing.
+    """
+
+    def __init__(self, function: Callable[[Any], None]) -> None:
+        self.function = function
+        self.__doc__ = function.__doc__
+        self._compiled: Any = None
+
+    @property
+    def address(self) -> int:
+        """Address of the C function ``void (*)(int64_t *)``; compiles, or reads the cache, the first time."""
+        if self._compiled is None:
+            with _COMPILING:
+                if self._compiled is None:
+                    self._compiled = self._compile()
+        return int(self._compiled.address)
+
+    @property
+    def name(self) -> str:
+        """Of module and function, as its files in the cache begin."""
+        return f"{self.function.__module__.rpartition('.')[2]}.{self.function.__name__}"
+
+    @property
+    def _folder(self) -> str:
+        """Of the cache, which need not exist."""
+        cache = FunctionCache(self.function)  # type: ignore[no-untyped-call]
+        return str(cache.cache_path)
+
+    @property
+    def cached(self) -> bool:
+        """Whether a process has compiled the kernel, or is at it."""
+        folder = Path(self._folder)
+        return (folder / f"{self.name}.lock").exists()
+
+    def _compile(self) -> Any:
+        compiled: Any = functools.partial(cfunc, types.void(_TABLE), fastmath=_FAST, **_OPTIONS)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", NumbaWarning)
+            try:
+                folder = self._folder
+                with one_process(folder, "gridreg-kernels"):
+                    empty = forget_outdated(folder)
+                if empty and can_lock() and self.function.__module__.startswith(__package__):
+                    _compile_ahead()
+                with one_process(folder, self.name):
+                    return compiled(cache=True)(self.function)
+            except (RuntimeError, OSError):
+                # No folder to keep a cache in: neither beside the source nor in the user's.
+                return compiled(cache=False)(self.function)
+
+
+kernel = Kernel
+
+
+@functools.cache
+def _compile_ahead() -> None:
+    # Here, as that module uses this one.
+    from gridreg.ops.cpu.jit import precompile as ahead
+
+    ahead.start()
+
+
+def inline(function: Callable[..., Any]) -> Any:
+    """Mark a function that kernels call: compiled with them, fast arithmetic, no checks of bounds."""
+    return njit(fastmath=_FAST, **_HELPER)(function)
+
+
+def exact(function: Callable[..., Any]) -> Any:
+    """Like `inline`, with every operation rounded on its own, in the order written."""
+    return njit(fastmath=False, **_HELPER)(function)
+
+
+def _word(builder: Any, table: Any, place: Any, offset: int) -> Any:
+    """Word ``offset`` of argument ``place``."""
+    at = builder.add(builder.mul(place, _WORD(4)), _WORD(2 + offset))
+    return builder.load(builder.gep(table, [at]))
+
+
+def _place(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    return context.cast(builder, arguments[1], signature.args[1], types.int64)
+
+
+@intrinsic
+def next_task(context: Any, table: Any) -> Any:
+    """``next_task(table)``: number of a task that no other thread has, or -1 when all are taken."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        task = builder.atomic_rmw("add", arguments[0], _WORD(1), "monotonic")
+        tasks = builder.load(builder.gep(arguments[0], [_WORD(1)]))
+        return builder.select(builder.icmp_signed("<", task, tasks), task, _WORD(-1))
+
+    return types.int64(_TABLE), generate
+
+
+@intrinsic
+def size(context: Any, table: Any, place: Any, axis: Any) -> Any:
+    """``size(table, place, axis)``: length of a tensor along an axis; 1 for an axis that it does not have."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        axis = context.cast(builder, arguments[2], signature.args[2], types.int64)
+        at = builder.mul(_place(context, builder, signature, arguments), _WORD(4))
+        return builder.load(builder.gep(arguments[0], [builder.add(builder.add(at, axis), _WORD(3))]))
+
+    return types.int64(_TABLE, place, axis), generate
+
+
+@intrinsic
+def integer(context: Any, table: Any, place: Any) -> Any:
+    """``integer(table, place)``: an integer."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return _word(builder, arguments[0], _place(context, builder, signature, arguments), 0)
+
+    return types.int64(_TABLE, place), generate
+
+
+@intrinsic
+def real(context: Any, table: Any, place: Any) -> Any:
+    """``real(table, place)``: a number, as float32."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        bits = _word(builder, arguments[0], _place(context, builder, signature, arguments), 0)
+        return builder.fptrunc(builder.bitcast(bits, ir.DoubleType()), ir.FloatType())
+
+    return types.float32(_TABLE, place), generate
+
+
+def _wrap(context: Any, builder: Any, kind: Any, data: Any, shape: list[Any]) -> Any:
+    """An array of type ``kind`` around memory."""
+    array = arrayobj.make_array(kind)(context, builder)  # type: ignore[no-untyped-call]
+    itemsize = context.get_constant(types.intp, context.get_abi_sizeof(context.get_data_type(kind.dtype)))
+    strides = [itemsize]
+    for length in reversed(shape[1:]):
+        strides.insert(0, builder.mul(length, strides[0]))
+    data = builder.bitcast(data, array.data.type)
+    arrayobj.populate_array(  # type: ignore[no-untyped-call]
+        array, data=data, shape=shape, strides=strides, itemsize=itemsize, meminfo=None
+    )
+    return array._getvalue()
+
+
+def _tensor(axes: int, name: str, text: str) -> Any:
+    def typed(context: Any, table: Any, place: Any, dtype: Any) -> Any:
+        kind = types.Array(dtype.dtype, axes, "C")
+
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            place = _place(context, builder, signature, arguments)
+            data = builder.inttoptr(_word(builder, arguments[0], place, 0), ir.IntType(8).as_pointer())
+            lengths = [_word(builder, arguments[0], place, 1 + axis) for axis in range(3)]
+            # What a tensor has in more axes than asked for belongs to the last.
+            shape = [*lengths[: axes - 1], functools.reduce(builder.mul, lengths[axes - 1 :])]
+            return _wrap(context, builder, kind, data, shape)
+
+        return kind(_TABLE, place, dtype), generate
+
+    typed.__name__, typed.__doc__ = name, text
+    return intrinsic(typed)
+
+
+vector = _tensor(1, "vector", "``vector(table, place, dtype)``: a tensor as ``(N,)``, all of its elements.")
+matrix = _tensor(2, "matrix", "``matrix(table, place, dtype)``: a tensor of two axes.")
+cube = _tensor(3, "cube", "``cube(table, place, dtype)``: a tensor of three axes.")
+
+
+@intrinsic(prefer_literal=True)
+def scratch(context: Any, length: Any, dtype: Any) -> Any:
+    """``scratch(length, dtype)``: memory of a constant length on the stack; only for the function that asks for it."""
+    if not isinstance(length, types.IntegerLiteral):
+        return None
+    kind = types.Array(dtype.dtype, 1, "C")
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        count = signature.args[0].literal_value
+        block = ir.ArrayType(context.get_data_type(kind.dtype), count)
+        # numba's own `alloca_once` also writes zeros, element by element: code of the length of the memory.
+        with builder.goto_entry_block():
+            memory = builder.alloca(block)
+        return _wrap(context, builder, kind, memory, [context.get_constant(types.intp, count)])
+
+    return kind(length, dtype), generate

@@ -1,0 +1,95 @@
+"""A second process that compiles kernels while the first one does, from the other end.
+
+A run compiles what it uses, in the order in which it uses it, and numba compiles one function at a time. Where the
+cache is empty, the process that finds it so starts another one, which begins with what a run needs last and ends where
+both meet: on two processors a first run waits little more than half as long. What neither of the two needs is not
+compiled.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import importlib
+import os
+import subprocess
+import sys
+
+from gridreg.cores import usable_cores
+from gridreg.ops.cpu.mlp.gemm_bf16 import available
+
+__all__ = ["main", "start"]
+
+_SWITCH = "GRIDREG_COMPILE_AHEAD"
+# Of a run with a VM field, from the one that it compiles last.
+_ORDER = (
+    "encode._forward",
+    "cpu.vm._density",
+    "cpu.adam.update._flat",
+    "cpu.adam.update._grid",
+    "cpu.adam.update._edges",
+    "cpu.vm_gradient._density_backward",
+    "cpu.reductions._thin",
+    "cpu.reductions._measure",
+    "cpu.composite._weights_backward",
+    "cpu.vm_gradient._low_features_backward",
+    "cpu.counting_sort._sort",
+    "cpu.mlp.dots._low",
+    "cpu.mlp.dots._sum_rows",
+    "cpu.reductions._fold",
+    "cpu.mlp.fused_bf16.backward",
+    "cpu.mlp.fused_f32.backward",
+    "cpu.pooling._gather",
+    "cpu.composite._pixels_backward",
+    "cpu.composite._pixels_forward",
+    "cpu.pooling._spread",
+    "cpu.mlp.fused_bf16.forward",
+    "cpu.mlp.fused_f32.forward",
+)
+# Modules that only a processor with dot products of bfloat16 needs, and that only others need.
+_DOTS, _OTHERS = ("cpu.mlp.dots", "cpu.mlp.fused_bf16"), ("cpu.mlp.fused_f32",)
+
+
+def start() -> subprocess.Popen[bytes] | None:
+    """Start the second process, if a processor is free for it; it ends with this one.
+
+    The variable ``GRIDREG_COMPILE_AHEAD=0`` forbids it.
+    """
+    frozen = getattr(sys, "frozen", False) or not sys.executable
+    if frozen or usable_cores() < 2 or os.environ.get(_SWITCH, "1") == "0":
+        return None
+    try:
+        helper = subprocess.Popen(
+            [sys.executable, "-m", __name__],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            env={**os.environ, _SWITCH: "0", "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        )
+    except OSError:
+        return None
+    atexit.register(_stop, helper)
+    return helper
+
+
+def _stop(helper: subprocess.Popen[bytes]) -> None:
+    # Files of the cache are written beside and renamed, so none is left half-written.
+    helper.terminate()
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        helper.wait(5)
+
+
+def main() -> None:
+    """Compile until there is a kernel that another process has compiled."""
+    for name in _ORDER:
+        module, _, function = name.rpartition(".")
+        if module in (_OTHERS if available() else _DOTS):
+            continue
+        kernel = getattr(importlib.import_module(f"gridreg.ops.{module}"), function)
+        if kernel.cached:
+            break
+        _ = kernel.address
+
+
+if __name__ == "__main__":
+    main()

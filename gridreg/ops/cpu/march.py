@@ -1,0 +1,265 @@
+"""Compiled ray march: the samples of `gridreg.ops.ray_reference.march`, bit for bit, without visiting empty
+space."""
+
+from __future__ import annotations
+
+import threading
+import weakref
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gridreg.ops.cpu.jit.compiler import (
+    cube,
+    exact,
+    float32,
+    int64,
+    kernel,
+    matrix,
+    next_task,
+    real,
+    uint8,
+    vector,
+)
+from gridreg.ops.cpu.jit.launch import launch
+from gridreg.ops.cpu.march_bits import Marked, distance_of, next_bit, sample_at
+from gridreg.ops.ray_reference import CELL_TOLERANCE, steps_bound
+
+__all__ = ["mark", "march"]
+
+# Edge, in cells, of the blocks that are skipped whole when nothing in them is occupied.
+_COARSE = np.uint32(4)
+_TOLERANCE = np.float32(CELL_TOLERANCE)
+# Relative rounding of a position computed in float32 by a handful of operations, with room to spare.
+_ROUNDING = np.float32(2e-6)
+_ONE = np.int64(1)
+_ZERO_F, _ONE_F = np.float32(0), np.float32(1)
+_INFINITE = np.float32(np.inf)
+# Rays of one task.
+_RAYS = 32
+_kept = threading.local()
+
+
+@kernel
+def _coarsen(table: Any) -> None:
+    """Mark the blocks of ``_COARSE^3`` cells in which any cell is occupied; a task is one slab of blocks."""
+    cells, coarse, columns = cube(table, 0, uint8), cube(table, 1, uint8), matrix(table, 2, uint8)
+    nx, ny, nz = cells.shape
+    while True:
+        a = next_task(table)
+        if a < 0:
+            break
+        column = columns[a]
+        for b in range(coarse.shape[1]):
+            for k in range(nz):
+                column[k] = 0
+            for i in range(a * _COARSE, min(nx, (a + 1) * _COARSE)):
+                for j in range(b * _COARSE, min(ny, (b + 1) * _COARSE)):
+                    row = cells[i, j]
+                    for k in range(nz):
+                        column[k] |= row[k]
+            for c in range(coarse.shape[2]):
+                occupied = False
+                for k in range(c * _COARSE, min(nz, (c + 1) * _COARSE)):
+                    occupied |= column[k] != 0
+                coarse[a, b, c] = occupied
+
+
+@exact
+def _slab(origin: Any, direction: Any, far: Any, lower: Any, scale: Any, edge: Any) -> tuple[Any, Any, Any]:
+    """Of one axis: which face of a cell the ray leaves by, and a distance before it as ``(i - at) * rate``.
+
+    Along the ray the cell coordinate is ``start + t * speed`` up to ``slack`` cells of rounding.
+    """
+    start = (origin - lower) * scale
+    speed = direction * scale
+    slack = _ROUNDING * (scale * (abs(origin) + abs(lower) + abs(far * direction)) + edge)
+    if speed > 0:
+        return _ONE_F, start + slack, _ONE_F / speed
+    if speed < 0:
+        return _ZERO_F, start - slack, _ONE_F / speed
+    return _ZERO_F, -_ONE_F, _INFINITE
+
+
+# `exact`, as contracted or reordered arithmetic would move samples across cell faces.
+@exact
+def _mark_ray(
+    o: Any, d: Any, near: Any, far: Any, shift: Any, step: Any, cells: Any, coarse: Any, box: Any, bits: Any
+) -> int:
+    """Set the bits of the kept lattice indices of one ray and return their number."""
+    nx, ny, nz = cells.shape
+    edge_x, edge_y, edge_z = np.float32(nx), np.float32(ny), np.float32(nz)
+    limit_x, limit_y, limit_z = edge_x + _TOLERANCE, edge_y + _TOLERANCE, edge_z + _TOLERANCE
+    ox, oy, oz = o[0], o[1], o[2]
+    dx, dy, dz = d[0], d[1], d[2]
+    lx, ly, lz = box[0, 0], box[0, 1], box[0, 2]
+    sx, sy, sz = box[1, 0], box[1, 1], box[1, 2]
+    face_x, at_x, rate_x = _slab(ox, dx, far, lx, sx, edge_x)
+    face_y, at_y, rate_y = _slab(oy, dy, far, ly, sy, edge_y)
+    face_z, at_z, rate_z = _slab(oz, dz, far, lz, sz, edge_z)
+    steps = bits.shape[0] * 64
+    per_step = 1 / np.float64(step)
+    count = 0
+    index = 0
+    while index < steps:
+        t = near + (np.float32(index) + shift) * step
+        if not t < far:
+            break
+        x, y, z = ((ox + t * dx) - lx) * sx, ((oy + t * dy) - ly) * sy, ((oz + t * dz) - lz) * sz
+        index += 1
+        below = (x < -_TOLERANCE) | (y < -_TOLERANCE) | (z < -_TOLERANCE)
+        if below | (not ((x <= limit_x) & (y <= limit_y) & (z <= limit_z))):
+            continue
+        # Unsigned, so that indexing has no branch for negative numbers.
+        i = np.uint32(min(max(x, _ZERO_F), edge_x - _ONE_F))
+        j = np.uint32(min(max(y, _ZERO_F), edge_y - _ONE_F))
+        k = np.uint32(min(max(z, _ZERO_F), edge_z - _ONE_F))
+        # The coarse blocks first: they stay in the first-level cache.
+        if coarse[i // _COARSE, j // _COARSE, k // _COARSE]:
+            if cells[i, j, k]:
+                bits[(index - 1) >> 6] |= _ONE << ((index - 1) & 63)
+                count += 1
+                continue
+            size = _ONE_F
+        else:
+            size = np.float32(_COARSE)
+            i, j, k = i // _COARSE * _COARSE, j // _COARSE * _COARSE, k // _COARSE * _COARSE
+        leave = (np.float32(i) + face_x * size - at_x) * rate_x
+        leave = min(leave, (np.float32(j) + face_y * size - at_y) * rate_y)
+        leave = min(leave, (np.float32(k) + face_z * size - at_z) * rate_z)
+        last = (np.float64(leave) - near) * per_step - shift
+        if last >= index:
+            index = int(min(last, np.float64(steps))) + 1
+    return count
+
+
+@kernel
+def _mark(table: Any) -> None:
+    """Find the samples of blocks of rays: bits of their lattice indices, and their counts."""
+    o, d = matrix(table, 0, float32), matrix(table, 1, float32)
+    near, far, shift = vector(table, 2, float32), vector(table, 3, float32), vector(table, 4, float32)
+    step = real(table, 5)
+    cells, coarse, box = cube(table, 6, uint8), cube(table, 7, uint8), matrix(table, 8, float32)
+    bits, counts = matrix(table, 9, int64), vector(table, 10, int64)
+    while True:
+        task = next_task(table)
+        if task < 0:
+            break
+        for ray in range(task * _RAYS, min((task + 1) * _RAYS, o.shape[0])):
+            counts[ray] = _mark_ray(
+                o[ray], d[ray], near[ray], far[ray], shift[ray], step, cells, coarse, box, bits[ray]
+            )
+
+
+@kernel
+def _fill(table: Any) -> None:
+    """Write out the marked samples of blocks of rays."""
+    o, d = matrix(table, 0, float32), matrix(table, 1, float32)
+    near, shift, step = vector(table, 2, float32), vector(table, 3, float32), real(table, 4)
+    bits, offsets = matrix(table, 5, int64), vector(table, 6, int64)
+    index, t, x = vector(table, 7, int64), vector(table, 8, float32), matrix(table, 9, float32)
+    while True:
+        task = next_task(table)
+        if task < 0:
+            break
+        for ray in range(task * _RAYS, min((task + 1) * _RAYS, o.shape[0])):
+            i = int64(-1)
+            for n in range(offsets[ray], offsets[ray + 1]):
+                i = next_bit(bits[ray], i + 1)
+                index[n], t[n] = i, distance_of(near[ray], shift[ray], step, i)
+                for axis in range(3):
+                    x[n, axis] = sample_at(o[ray], d[ray], axis, t[n])
+
+
+class _Blocks(NamedTuple):
+    """Whose blocks they are, in which version of the cells, and the blocks."""
+
+    of: weakref.ref[Tensor]
+    version: int | None
+    coarse: Tensor
+
+
+def _coarse(cells: Tensor, grid: Tensor) -> Tensor:
+    """Which blocks of cells hold an occupied one; kept for the thread's next march through the same cells."""
+    version = None if cells.is_inference() else cells._version
+    kept: _Blocks | None = getattr(_kept, "blocks", None)
+    if kept is not None and version is not None and kept.of() is cells and kept.version == version:
+        return kept.coarse
+    coarse = torch.empty(*(-(-n // int(_COARSE)) for n in grid.shape), dtype=torch.uint8)
+    launch(
+        _coarsen, coarse.shape[0], grid, coarse, torch.empty(len(coarse), grid.shape[2], dtype=torch.uint8)
+    )
+    _kept.blocks = _Blocks(weakref.ref(cells), version, coarse)
+    return coarse
+
+
+@torch.no_grad()
+def mark(
+    origins: Tensor,
+    directions: Tensor,
+    t_min: Tensor,
+    t_max: Tensor,
+    step: float,
+    cells: Tensor,
+    bounds: Tensor,
+    jitter: Tensor | float,
+) -> Marked:
+    """Find the samples of a march; arguments as of `march`."""
+    rays = origins.shape[0]
+    steps = steps_bound(t_min, t_max, step)
+    o, d, near, far = (x.contiguous() for x in (origins, directions, t_min, t_max))
+    shift = torch.as_tensor(jitter, dtype=torch.float32).expand(rays).contiguous()
+    grid = cells.contiguous().view(torch.uint8)
+    shape = torch.tensor(grid.shape)
+    box = torch.stack([bounds[0], shape.to(bounds.dtype) / (bounds[1] - bounds[0])])
+    coarse = _coarse(cells, grid)
+    bits, counts = torch.zeros(rays, -(-steps // 64), dtype=torch.int64), torch.zeros(rays, dtype=torch.int64)
+    tasks = -(-rays // _RAYS)
+
+    launch(_mark, tasks if steps else 0, o, d, near, far, shift, step, grid, coarse, box, bits, counts)
+    offsets = torch.zeros(rays + 1, dtype=torch.int64)
+    torch.cumsum(counts, 0, out=offsets[1:])
+    return Marked(o, d, near, shift, bits, offsets)
+
+
+@torch.no_grad()
+def march(
+    origins: Tensor,
+    directions: Tensor,
+    t_min: Tensor,
+    t_max: Tensor,
+    step: float,
+    cells: Tensor,
+    bounds: Tensor,
+    jitter: Tensor | float,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """See `gridreg.ops.rays.march`; CPU float32 tensors.
+
+    Empty cells, and whole empty blocks of cells, are left by the step after the ray's exit from them
+    (Amanatides and Woo 1987), so the cost follows the number of cells that a ray meets near surfaces; samples
+    stay on the lattice.
+    """
+    o, d, near, shift, bits, offsets = mark(origins, directions, t_min, t_max, step, cells, bounds, jitter)
+    samples = int(offsets[-1])
+    index, t, positions = (
+        torch.empty(samples, dtype=torch.int64),
+        torch.empty(samples),
+        torch.empty(samples, 3),
+    )
+    launch(
+        _fill,
+        -(-o.shape[0] // _RAYS) if samples else 0,
+        o,
+        d,
+        near,
+        shift,
+        step,
+        bits,
+        offsets,
+        index,
+        t,
+        positions,
+    )
+    return offsets, index, t, positions

@@ -1,0 +1,1 @@
+"""Small networks: encodings and layers in one kernel."""

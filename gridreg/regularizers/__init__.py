@@ -1,0 +1,1 @@
+"""The regularizers, and the plain functions that they are made of."""

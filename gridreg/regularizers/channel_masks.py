@@ -1,0 +1,182 @@
+"""Masks as regularizers: which channels of a site are open at which step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from gridreg.attach.sites import Place, SiteLike
+from gridreg.base import Context, Regularizer, register
+from gridreg.errors import InputError
+from gridreg.regularizers import mask_functions as masks
+from gridreg.regularizers.mask_base import Mask
+from gridreg.schedules import Linear, Numeric, check_numeric, check_until, fixed_end
+
+__all__ = ["CosineMask", "FixedMask", "FrequencyMask"]
+
+
+@register
+@dataclass(frozen=True)
+class FrequencyMask(Mask):
+    """FreeNeRF's frequency mask: channels open from low to high until all are open.
+
+    Args:
+        site: where it acts. Where the site knows octaves, whole octaves open, the identity first.
+        until: fraction of the run (float) or step (int) from which all is open.
+        block: ranks that open together, at most all; by default 3 channels, or 1 octave.
+        variant: "block" (`gridreg.frequency_mask`), or, by channel index and for comparison only, "printed"
+            (`gridreg.printed_frequency_mask`) and "authors" (`gridreg.authors_frequency_mask`).
+        detach: closed channels keep their values and only lose their gradient.
+
+    Formula: ``p = min(L/B t/T + 1, L/B)``; channels below ``B int(p)`` 1, the next B ``p - int(p)``, the rest
+    0
+    Unit: none
+    Source: FreeNeRF (Yang et al., CVPR 2023), section 3.3; on components of a grid: Few TensoRF.
+
+    >>> FrequencyMask("density", until=0.9)
+    FrequencyMask(site='density', detach=False, until=0.9, block=None, variant='block')
+    """
+
+    until: Numeric = 0.9
+    block: int | None = None
+    variant: Literal["block", "printed", "authors"] = "block"
+
+    def __post_init__(self) -> None:
+        """Refuse what no run could use."""
+        super().__post_init__()
+        check_until(self.until)
+        if self.variant not in ("block", "printed", "authors"):
+            raise InputError(f"variant={self.variant!r}: expected 'block', 'printed' or 'authors'")
+        if self.block is not None and (isinstance(self.block, bool) or not self.block >= 1):
+            raise InputError(f"block={self.block!r}: expected a number of channels, an int above 0, or None")
+
+    def ranks(self, place: Place) -> tuple[int, ...]:
+        """By octave where known; the variants know only the index."""
+        if self.variant == "block":
+            return super().ranks(place)
+        return tuple(range(place.channels or 0))
+
+    def mask(self, context: Context) -> Tensor:
+        """The mask over the channels that take part, shape `(channels,)`."""
+        place = context.place
+        if self.variant == "block" and self.block is None and place is not None and place.octaves is None:
+            # Fewer channels than a block count as one block.
+            channels = place.channels or 1
+            end = context.end(self.until)
+            return masks.frequency_mask(channels, context.step, end, block=min(3, channels))
+        return super().mask(context)
+
+    def rank_values(self, count: int, context: Context) -> Tensor:
+        """Mask over ranks."""
+        end = context.end(self.until)
+        if self.variant == "printed":
+            return masks.printed_frequency_mask(count, context.step, end)
+        if self.variant == "authors":
+            return masks.authors_frequency_mask(count, context.step, end, block=min(self.block or 5, count))
+        return masks.frequency_mask(count, context.step, end, block=min(self.block or 1, count))
+
+    def end(self, count: int, total_steps: int) -> int | None:
+        """The step that `until` stands for."""
+        return fixed_end(self.until, total_steps)
+
+    def monotone(self) -> bool:
+        """Not in the printed form."""
+        return self.variant != "printed"
+
+    @classmethod
+    def examples(cls, site: SiteLike) -> list[Regularizer]:
+        """Instances for the contract suite."""
+        return [
+            cls(site, until=0.9),
+            cls(site, until=7, block=2),
+            cls(site, until=0.5, detach=True),
+            cls(site, variant="authors"),
+            cls(site, variant="printed"),
+        ]
+
+
+@register
+@dataclass(frozen=True)
+class FixedMask(Mask):
+    """The lowest share of the channels (of the octaves, where known) stays open, the rest closed.
+
+    Args:
+        site: where it acts.
+        visible_ratio: open share, in [0, 1]: the first `int(channels * visible_ratio)`.
+        detach: closed channels keep their values and only lose their gradient.
+
+    Formula: the first ``int(L visible_ratio)`` channels 1, the rest 0
+    Unit: none
+    Source: Few TensoRF, human-body runs with 0.8.
+
+    >>> FixedMask("appearance", visible_ratio=0.8).visible_ratio
+    0.8
+    """
+
+    visible_ratio: Numeric = 0.8
+
+    def __post_init__(self) -> None:
+        """Refuse shares outside [0, 1]."""
+        super().__post_init__()
+        check_numeric("visible_ratio", self.visible_ratio, 0, 1)
+
+    def rank_values(self, count: int, context: Context) -> Tensor:
+        """Mask over ranks."""
+        return masks.fixed_mask(count, context.at(self.visible_ratio, "visible_ratio", 0, 1))
+
+    @classmethod
+    def examples(cls, site: SiteLike) -> list[Regularizer]:
+        """Instances for the contract suite."""
+        return [
+            cls(site),
+            cls(site, visible_ratio=0.5, detach=True),
+            cls(site, visible_ratio=Linear(0.3, 1.0)),
+        ]
+
+
+@register
+@dataclass(frozen=True)
+class CosineMask(Mask):
+    """BARF's window: one octave after the other opens smoothly, along half a cosine.
+
+    The lowest rank (the identity, if the site has it) is always open; the window runs over the ranks above
+    it.
+
+    Args:
+        site: where it acts; its octaves, or its channel indices where it knows none, are the ranks.
+        until: fraction of the run (float) or step (int) from which all is open.
+        detach: closed channels keep their values and only lose their gradient.
+
+    Formula: ``(1 - cos(pi clamp(L t/T - k, 0, 1))) / 2`` for octave k
+    Unit: none
+    Source: BARF (Lin et al., ICCV 2021), equation 14; Nerfies (Park et al., ICCV 2021), equation 8.
+
+    >>> CosineMask("encoding.position", until=0.5).until
+    0.5
+    """
+
+    until: Numeric = 0.9
+
+    def __post_init__(self) -> None:
+        """Refuse what no run could use."""
+        super().__post_init__()
+        check_until(self.until)
+
+    def rank_values(self, count: int, context: Context) -> Tensor:
+        """Mask over ranks."""
+        if count == 1:
+            return torch.ones(1)
+        window = masks.cosine_mask(count - 1, context.step, context.end(self.until))
+        return torch.cat([torch.ones(1), window])
+
+    def end(self, count: int, total_steps: int) -> int | None:
+        """The step that `until` stands for."""
+        return fixed_end(self.until, total_steps)
+
+    @classmethod
+    def examples(cls, site: SiteLike) -> list[Regularizer]:
+        """Instances for the contract suite."""
+        return [cls(site), cls(site, until=5), cls(site, detach=True)]

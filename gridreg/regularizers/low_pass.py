@@ -1,0 +1,216 @@
+"""Low-passes: the field sees its grids without their fine detail, which returns during training."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import torch
+from torch import Tensor
+
+from gridreg.attach.sites import SiteLike
+from gridreg.base import Context, Regularizer, check_site, register
+from gridreg.errors import InputError
+from gridreg.regularizers.filters import Boundary, fourier_low_pass, gaussian_blur
+from gridreg.schedules import Linear, Numeric, check_numeric
+
+__all__ = ["FourierLowPass", "SpatialAnnealing", "annealed_radius"]
+
+_FOURIERF_KEEP = Linear(0.3, 1.0, until=2000)
+
+
+def annealed_radius(
+    step: float, end: float, *, start: float = 0.15, rounds: int = 30, rate: float = 0.2, floor: float = 0.0
+) -> float:
+    """Blur radius that shrinks by rounds: ``floor + start / 2^(rate * int(rounds * step / end))``.
+
+    Args:
+        step: current step, iterations.
+        end: step from which the radius is `floor`, iterations. (With SANeRF's numbers the last round before
+            still has 1/64 of the start, a third of a voxel at 128^3.)
+        start: radius at step 0 above the floor, share of the grid's edge.
+        rounds: number of rounds.
+        rate: halvings per round.
+        floor: radius at the end, share of the grid's edge.
+
+    Returns:
+        Radius as a share of the grid's edge. Source: SANeRF (Xiao et al. 2024).
+
+    Example:
+        >>> annealed_radius(0, 300), annealed_radius(50, 300), annealed_radius(300, 300)
+        (0.15, 0.075, 0.0)
+    """
+    if step >= end:
+        return floor
+    return floor + start / 2 ** (rate * math.floor(rounds * step / end))
+
+
+@dataclass(frozen=True)
+class _GridFilter(Regularizer):
+    """What both low-passes share: they act on grids, by one number that they keep in the state."""
+
+    acts_on: ClassVar[Literal["mask", "grids"]] = "grids"
+
+    def number(self, context: Context) -> float:
+        """What the filter depends on at this step."""
+        return 0.0
+
+    def prepare(self, context: Context) -> None:
+        """Keep the number of this step."""
+        if context.place is not None and not context.place.spatial:
+            raise InputError(
+                f"{context.place.name}: has no spatial axis longer than 1; name its axes with spatial=..."
+            )
+        number = torch.tensor(self.number(context), dtype=torch.float64)
+        if "number" in context.state:
+            context.state["number"].copy_(number)
+        else:
+            context.state["number"] = number
+
+    def value(self, context: Context) -> float:
+        """The number now."""
+        return self.number(context)
+
+
+def _number(context: Context) -> float | Tensor:
+    """The number of this step; while compiling as a tensor, so that the next step needs no new code."""
+    number = context.state["number"]
+    return number if torch.compiler.is_compiling() else float(number)
+
+
+def _filtered(
+    value: Tensor, context: Context, function: Callable[[Tensor, tuple[int, ...]], Tensor]
+) -> Tensor:
+    """The grid with the channels that take part filtered."""
+    place = context.place
+    if place is None:
+        return value
+    if place.selected is None:
+        return function(value, place.spatial)
+    chosen = torch.tensor(place.selected, device=value.device)
+    part = function(value.index_select(place.dim, chosen), place.spatial)
+    return value.index_copy(place.dim, chosen, part)
+
+
+@register
+@dataclass(frozen=True)
+class FourierLowPass(_GridFilter):
+    """The field sees the low frequencies of its grids, first few, at the end all: see `fourier_low_pass`.
+
+    The parameters stay as they are, and frequencies that are filtered out get no gradient. The share is of
+    the present spectrum, whatever size the grid has been resampled to.
+
+    Args:
+        site: its `grids` are filtered, each along its spatial axes: lines, planes or voxels.
+        keep: share of the spectrum that stays, in [0, 1]. FourieRF: from 0.3 to 1 in 2,000 steps on
+            synthetic scenes, from 0.01 in 10,000 on real ones.
+        boundary: "periodic" (Fourier) or "mirror" (cosine).
+
+    Formula: ``g_hat(k) * clamp(keep * K - k + 1, 0, 1)`` for the frequencies k = 0..K of each axis
+    Unit: share of the spectrum
+    Source: FourieRF (Gomez et al. 2025)
+
+    Raises:
+        InputError: keep lies outside [0, 1], the boundary is unknown, or a grid has no spatial axes.
+
+    Example:
+        >>> FourierLowPass("density", keep=Linear(0.1, 1.0, until=0.3)).keep.at(300, 1000)
+        1.0
+    """
+
+    site: SiteLike
+    keep: Numeric = _FOURIERF_KEEP
+    boundary: Boundary = "periodic"
+
+    def __post_init__(self) -> None:
+        """Refuse at once what can be refused before the first step."""
+        check_site(self.site)
+        check_numeric("keep", self.keep, 0.0, 1.0)
+        if self.boundary not in ("periodic", "mirror"):
+            raise InputError(f"boundary={self.boundary!r}: expected 'periodic' or 'mirror'")
+
+    def number(self, context: Context) -> float:
+        """Share of the spectrum."""
+        return context.at(self.keep, "keep", 0.0, 1.0)
+
+    def is_identity(self, context: Context) -> bool:
+        """The whole spectrum passes."""
+        return float(context.state["number"]) == 1
+
+    def transform(self, value: Tensor, context: Context) -> Tensor:
+        """The grid without its high frequencies."""
+        keep = _number(context)
+        return _filtered(value, context, lambda v, axes: fourier_low_pass(v, axes, keep, self.boundary))
+
+    @classmethod
+    def examples(cls, site: SiteLike) -> list[Regularizer]:
+        """Opening, fixed, and with mirrored borders."""
+        return [cls(site, Linear(0.1, 1.0, until=0.5)), cls(site, 0.4), cls(site, 0.0, boundary="mirror")]
+
+
+@register
+@dataclass(frozen=True)
+class SpatialAnnealing(_GridFilter):
+    """The field sees its grids blurred, less and less: see `annealed_radius` and `gaussian_blur`.
+
+    SANeRF widens the footprint of its samples on mip-mapped planes; for a field without mip-maps a blur of
+    the grid does the same. The radius is a share of the grid's edge, so it survives resampling.
+
+    Args:
+        site: its `grids` are blurred, each along its spatial axes.
+        until: fraction of the run (float) or step (int) from which the radius is `floor`.
+        start: first radius (standard deviation), share of the grid's edge; SANeRF: 0.15.
+        rounds: number of steps in which it shrinks; SANeRF: 30.
+        rate: halvings per round; SANeRF: 0.2.
+        floor: radius that stays, share of the grid's edge.
+
+    Formula: Gaussian blur by ``floor + start / 2^(rate * int(rounds * t / T))``
+    Unit: share of the grid's edge
+    Source: SANeRF (Xiao et al. 2024)
+
+    Raises:
+        InputError: a number is out of range, or a grid has no spatial axes.
+
+    Example:
+        >>> SpatialAnnealing("density", until=0.3).start
+        0.15
+    """
+
+    site: SiteLike
+    until: Numeric = 0.3
+    start: Numeric = 0.15
+    rounds: Numeric = 30
+    rate: Numeric = 0.2
+    floor: Numeric = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse at once what can be refused before the first step."""
+        check_site(self.site)
+        check_numeric("until", self.until, low=0.0)
+        for name in ("start", "rounds", "rate", "floor"):
+            check_numeric(name, getattr(self, name), low=0.0)
+
+    def number(self, context: Context) -> float:
+        """Radius, share of the grid's edge."""
+        start, rate, floor = (
+            context.at(getattr(self, name), name, low=0.0) for name in ("start", "rate", "floor")
+        )
+        rounds = int(context.at(self.rounds, "rounds", low=0.0))
+        end = context.end(self.until)
+        return annealed_radius(context.step, end, start=start, rounds=rounds, rate=rate, floor=floor)
+
+    def is_identity(self, context: Context) -> bool:
+        """The radius is 0."""
+        return float(context.state["number"]) == 0
+
+    def transform(self, value: Tensor, context: Context) -> Tensor:
+        """The blurred grid."""
+        radius = _number(context)
+        return _filtered(value, context, lambda v, axes: gaussian_blur(v, axes, radius))
+
+    @classmethod
+    def examples(cls, site: SiteLike) -> list[Regularizer]:
+        """At its default, and with a blur that stays."""
+        return [cls(site, until=0.5), cls(site, until=3, floor=0.05)]

@@ -1,0 +1,152 @@
+"""What all channel masks share: ranks of channels, multiplication at a site, closed channels without
+effect."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gridreg.attach.sites import Place, SiteLike
+from gridreg.base import Context, Regularizer, check_site
+from gridreg.errors import InputError
+from gridreg.regularizers.mask_functions import channel_ranks
+
+__all__ = ["Mask", "broadcast", "remember", "spread"]
+
+
+@dataclass(frozen=True)
+class Mask(Regularizer):
+    """Base of all masks. A subclass says how channels are ranked and what each rank is multiplied by.
+
+    A closed channel has exactly no effect and no gradient, even where its values are infinite or not numbers.
+
+    Args:
+        site: where it acts: declared name, `parameters`, `outputs` or `inputs`.
+        detach: closed channels keep their values and only lose their gradient.
+    """
+
+    site: SiteLike
+    detach: bool = field(default=False, kw_only=True)
+
+    def __post_init__(self) -> None:
+        """Refuse what is not a site."""
+        check_site(self.site)
+
+    def ranks(self, place: Place) -> tuple[int, ...]:
+        """Rank of each channel, low ranks open first: by octave where known, else by index."""
+        return channel_ranks(place.octaves or tuple(range(place.channels or 0)))
+
+    def rank_values(self, count: int, context: Context) -> Tensor:
+        """Mask over `count` ranks, shape `(count,)`, at the context's step."""
+        return torch.ones(count)
+
+    def end(self, count: int, total_steps: int) -> int | None:
+        """Step from which all of `count` ranks are open, None if that never is or cannot be told."""
+        return None
+
+    def monotone(self) -> bool:
+        """Whether it never opens a higher rank more than a lower one, and never closes again."""
+        return True
+
+    def mask(self, context: Context) -> Tensor:
+        """The mask over the channels that take part, shape `(channels,)`, float32."""
+        if context.place is None:
+            raise InputError("context: a mask has one only at a place")
+        ranks = self.ranks(context.place)
+        return self.rank_values(max(ranks) + 1, context)[_indices(ranks)]
+
+    def prepare(self, context: Context) -> None:
+        """Keep the mask over all channels of the tensor in the state."""
+        remember(context, "mask", spread(self.mask(context), context.place))
+
+    def is_identity(self, context: Context) -> bool:
+        """Fully open."""
+        return bool((context.state["mask"] == 1).all())
+
+    def is_over(self, context: Context) -> bool:
+        """Past its end."""
+        ranks = () if context.place is None else self.ranks(context.place)
+        end = self.end(max(ranks, default=0) + 1, context.total_steps)
+        return end is not None and context.step >= end
+
+    def gradient_only(self) -> bool:
+        """Whether values stay and only gradients change."""
+        return self.detach
+
+    def closed_channels(self, context: Context) -> Tensor | None:
+        """Where the mask is 0."""
+        closed: Tensor = context.state["mask"] <= 0
+        return None if self.detach else closed
+
+    def transform(self, value: Tensor, context: Context) -> Tensor:
+        """Multiply the channels by the mask."""
+        mask = broadcast(context, "mask", value)
+        if self.detach:
+            scaled: Tensor = _ScaledGradient.apply(value, mask)  # type: ignore[no-untyped-call]
+            return scaled
+        # A product alone would let NaN and infinity through a closed channel.
+        return torch.where(mask > 0, value * mask, 0.0)
+
+    def value(self, context: Context) -> float:
+        """Open share of the channels."""
+        return float(self.mask(context).mean())
+
+
+class _ScaledGradient(torch.autograd.Function):
+    """The identity, with its gradient multiplied by a mask."""
+
+    @staticmethod
+    def forward(ctx: Any, value: Tensor, mask: Tensor) -> Tensor:
+        ctx.save_for_backward(mask)
+        return value.view_as(value)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        (mask,) = ctx.saved_tensors
+        return torch.where(mask > 0, gradient * mask, 0.0), None
+
+
+@lru_cache(maxsize=256)
+def _indices(values: tuple[int, ...]) -> Tensor:
+    """Indices as a tensor: made once, because masks are made at every step."""
+    return torch.tensor(values)
+
+
+def spread(values: Tensor, place: Place | None) -> Tensor:
+    """Factors of the channels that take part, spread over all channels of the tensor; the others get 1."""
+    if place is None or place.selected is None or place.size is None:
+        return values
+    factors = torch.ones(place.size)
+    factors[_indices(place.selected)] = values
+    return factors
+
+
+def remember(context: Context, name: str, value: Tensor) -> None:
+    """Put a tensor into the state, in place if there is one of this shape: compiled code holds on to it."""
+    known = context.state.get(name)
+    if known is not None and known.shape == value.shape:
+        known.copy_(value)
+    else:
+        context.state[name] = value
+
+
+def broadcast(context: Context, name: str, value: Tensor) -> Tensor:
+    """Factors from the state, shaped to multiply `value` along the channel axis of the context's place."""
+    factors = context.state[name]
+    if factors.device != value.device:
+        factors = context.state[name] = factors.to(value.device)
+    dim = -1 if context.place is None else context.place.dim
+    if value.shape[dim] != len(factors):
+        name = "" if context.place is None else context.place.name
+        raise InputError(
+            f"{name}: mask of {len(factors)} for {value.shape[dim]} channels; "
+            "replace parameters inside handle.suspended(), or call handle.step after it"
+        )
+    shape = [1] * value.ndim
+    shape[dim] = -1
+    # A copy, so that the next step may write into the state before this one's backward pass.
+    return factors.to(value.dtype, copy=True).reshape(shape)
