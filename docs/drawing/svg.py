@@ -35,6 +35,8 @@ def label(value: float) -> str:
 
 def simplified(points: NDArray[np.float64], tolerance: float = 0.06) -> NDArray[np.float64]:
     """Fewest points of a polyline ``(N, 2)`` that stay within a tolerance of it, pixels (Douglas-Peucker)."""
+    # Two points may be equally far away. Rounded, they are so on every processor, and the first of them is kept.
+    points = points.round(3)
     keep = np.zeros(len(points), bool)
     keep[[0, -1]] = True
     spans = [(0, len(points) - 1)]
