@@ -89,21 +89,21 @@ def empty_run(source: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_no_folder_and_no_pictures(refused: Refused, tmp_path: Path) -> None:
-    assert "nowhere: no such folder of pictures" in refused("prepare", "nowhere", "out")
+    assert "nowhere: no such folder of images" in refused("prepare", "nowhere", "out")
     (tmp_path / "pictures").mkdir()
-    assert "found nothing, expected pictures" in refused("prepare", "pictures", "out")
+    assert "found nothing, expected images" in refused("prepare", "pictures", "out")
     (tmp_path / "pictures/film.mov").write_text("")
-    assert "only .mov files, expected pictures" in refused("prepare", "pictures", "out")
+    assert "only .mov files, expected images" in refused("prepare", "pictures", "out")
     for k in range(3):
         picture(tmp_path / f"pictures/{k}.jpg")
-    assert "found 3 pictures, expected at least 4" in refused("prepare", "pictures", "out")
+    assert "found 3 images, expected at least 4" in refused("prepare", "pictures", "out")
 
 
 def test_pictures_of_different_sizes(refused: Refused, tmp_path: Path) -> None:
     for k in range(5):
         picture(tmp_path / f"pictures/{k}.png", (32, 24) if k != 3 else (24, 32))
     line = refused("prepare", "pictures", "out")
-    assert "3.png: picture is 24x32 upright, expected 32x24 as 0.png" in line
+    assert "3.png: image is 24x32 upright, expected 32x24 as 0.png" in line
 
 
 def test_pictures_of_different_sizes_with_one_intrinsics(refused: Refused, tmp_path: Path) -> None:
@@ -137,7 +137,7 @@ def test_pictures_that_cannot_be_registered(refused: Refused, tmp_path: Path) ->
         path.parent.mkdir(exist_ok=True)
         Image.new("RGB", (64, 48), (30 * k, 90, 90)).save(path)
     line = refused("prepare", "pictures", "out")
-    assert "only 0 of 4 pictures could be registered; take more pictures" in line
+    assert "only 0 of 4 images could be registered; take more images" in line
 
 
 def test_without_pycolmap(refused: Refused, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from gridreg.errors import InputError
 from gridreg.scenes import Scene, builtin_scene, builtin_surface, load_scene
 from gridreg.scenes.colmap_model import read_model
-from gridreg.scenes.lens import Distortion
+from gridreg.scenes.lens import LensDistortion
 
 SIZE = 16
 FOCAL = 22.0
@@ -151,11 +151,13 @@ def test_camera_models(original: tuple[Path, Scene], tmp_path: Path, name: str, 
     camera = read_model(tmp_path / "m").cameras[7]
     assert (camera.model, camera.width, camera.height) == (name, SIZE, SIZE)
     assert list(camera.parameters.values()) == MODELS[name][1]
-    lens = Distortion(**{key: value for key, value in camera.parameters.items() if key[0] in "kp"})
+    lens = LensDistortion(**{key: value for key, value in camera.parameters.items() if key[0] in "kp"})
     if name == "FULL_OPENCV":
-        assert lens == Distortion(k1=0.01, k2=-0.02, p1=0.001, p2=0.002, k3=0.03, k4=0.04, k5=0.05, k6=0.06)
+        assert lens == LensDistortion(
+            k1=0.01, k2=-0.02, p1=0.001, p2=0.002, k3=0.03, k4=0.04, k5=0.05, k6=0.06
+        )
     if name == "SIMPLE_RADIAL":
-        assert lens == Distortion(k1=0.01)
+        assert lens == LensDistortion(k1=0.01)
 
 
 def test_a_distorting_camera_is_undone(original: tuple[Path, Scene], scene: Path) -> None:
@@ -217,15 +219,15 @@ class TestBadInput:
         shutil.copytree(scene / "sparse/0", scene / "sparse/1")
         refused(scene, r"expected one COLMAP model, found sparse/0, sparse/1; leave only the one to use")
 
-    def test_no_pictures(self, scene: Path) -> None:
+    def test_no_images(self, scene: Path) -> None:
         shutil.rmtree(scene / "images")
-        refused(scene, r"folder images/ with the pictures of the COLMAP model not found")
+        refused(scene, r"folder images/ with the images of the COLMAP model not found")
 
-    def test_missing_picture(self, scene: Path) -> None:
+    def test_missing_image(self, scene: Path) -> None:
         (scene / "images/r_3.png").unlink()
         refused(scene, r"image r_3\.png: image .*images/r_3\.png not found")
 
-    def test_picture_of_another_size(self, scene: Path) -> None:
+    def test_image_of_another_size(self, scene: Path) -> None:
         Image.new("RGBA", (SIZE, 12)).save(scene / "images/r_3.png")
         refused(scene, r"images/r_3\.png: image is 16x12, expected w x h of its camera, 16x16")
 

@@ -20,15 +20,15 @@ from gridreg.scenes import builtin_scene, load_scene
 from gridreg.scenes.builtin.cameras import look_at_origin
 from gridreg.scenes.builtin.raycast import render_rgba
 from gridreg.scenes.images import read_mask, read_rgba
-from gridreg.scenes.lens import NO_DISTORTION, Distortion, undistort
+from gridreg.scenes.lens import NO_DISTORTION, LensDistortion, undistort
 
 small = st.floats(-0.08, 0.08)
 lenses = st.builds(
-    Distortion, k1=small, k2=small, p1=st.floats(-0.01, 0.01), p2=st.floats(-0.01, 0.01), k3=small
+    LensDistortion, k1=small, k2=small, p1=st.floats(-0.01, 0.01), p2=st.floats(-0.01, 0.01), k3=small
 )
 
 
-def opencv(lens: Distortion, x: float, y: float) -> tuple[float, float]:
+def opencv(lens: LensDistortion, x: float, y: float) -> tuple[float, float]:
     """Write the formula of OpenCV's manual out, term by term."""
     r = (x**2 + y**2) ** 0.5
     factor = (1 + lens.k1 * r**2 + lens.k2 * r**4 + lens.k3 * r**6) / (
@@ -40,12 +40,14 @@ def opencv(lens: Distortion, x: float, y: float) -> tuple[float, float]:
 
 
 @given(lenses, st.floats(-0.6, 0.6), st.floats(-0.6, 0.6), small, small, small)
-def test_distortion_is_opencvs(lens: Distortion, x: float, y: float, k4: float, k5: float, k6: float) -> None:
-    lens = Distortion(lens.k1, lens.k2, lens.p1, lens.p2, lens.k3, k4, k5, k6)
+def test_distortion_is_opencvs(
+    lens: LensDistortion, x: float, y: float, k4: float, k5: float, k6: float
+) -> None:
+    lens = LensDistortion(lens.k1, lens.k2, lens.p1, lens.p2, lens.k3, k4, k5, k6)
     np.testing.assert_allclose(lens.distort(np.array(x), np.array(y)), opencv(lens, x, y), atol=1e-12)
 
 
-def inverse(lens: Distortion, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def inverse(lens: LensDistortion, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Find what the lens shows at x, y by fixed-point iteration."""
     u, v = x, y
     for _ in range(60):
@@ -57,7 +59,7 @@ def inverse(lens: Distortion, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray,
 
 def test_a_pinhole_is_falsy_and_keeps_the_image() -> None:
     assert not NO_DISTORTION
-    assert Distortion(p2=1e-9)
+    assert LensDistortion(p2=1e-9)
     image = np.random.default_rng(0).random((6, 8, 4)).astype(np.float32)
     intrinsics = np.array([9.0, 9.0, 4.0, 3.0])
     same, values = undistort(image, intrinsics, NO_DISTORTION, "here")
@@ -67,7 +69,7 @@ def test_a_pinhole_is_falsy_and_keeps_the_image() -> None:
 
 @settings(max_examples=15, deadline=None)
 @given(lenses)
-def test_a_distorted_picture_becomes_the_pinhole_picture(lens: Distortion) -> None:
+def test_a_distorted_image_becomes_the_pinhole_image(lens: LensDistortion) -> None:
     # Smooth colours, functions of the viewing direction, so that resampling costs little.
     def colour(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         waves = [np.sin(5 * x + 2 * y), np.cos(4 * y - x), np.sin(3 * x * y + 1), np.ones_like(x)]
@@ -76,9 +78,9 @@ def test_a_distorted_picture_becomes_the_pinhole_picture(lens: Distortion) -> No
     intrinsics, width, height = np.array([70.0, 66.0, 41.0, 28.0]), 80, 60
     rows, columns = np.mgrid[:height, :width] + 0.5
     u, v = (columns - intrinsics[2]) / intrinsics[0], (rows - intrinsics[3]) / intrinsics[1]
-    picture = colour(*inverse(lens, u, v)).astype(np.float32)
-    flat, pinhole = undistort(picture, intrinsics, lens, "here")
-    assert flat.shape == picture.shape
+    image = colour(*inverse(lens, u, v)).astype(np.float32)
+    flat, pinhole = undistort(image, intrinsics, lens, "here")
+    assert flat.shape == image.shape
     np.testing.assert_array_equal(pinhole[2:], intrinsics[2:])
     assert pinhole[0] / intrinsics[0] == pytest.approx(pinhole[1] / intrinsics[1])
     expected = colour((columns - pinhole[2]) / pinhole[0], (rows - pinhole[3]) / pinhole[1])
@@ -87,7 +89,7 @@ def test_a_distorted_picture_becomes_the_pinhole_picture(lens: Distortion) -> No
 
 @given(lenses)
 @settings(max_examples=30, deadline=None)
-def test_the_zoom_is_the_least_that_shows_no_edge(lens: Distortion) -> None:
+def test_the_zoom_is_the_least_that_shows_no_edge(lens: LensDistortion) -> None:
     # An image that is its own column and row tells where each pixel was taken from.
     height, width = 40, 50
     rows, columns = np.mgrid[:height, :width] + 0.5
@@ -107,7 +109,7 @@ def test_the_zoom_is_the_least_that_shows_no_edge(lens: Distortion) -> None:
 def test_too_strong_a_lens() -> None:
     with pytest.raises(InputError, match=r"frame 3: lens distortion .* is too strong to be undone"):
         undistort(
-            np.zeros((9, 9, 4), np.float32), np.array([5.0, 5, 4.5, 4.5]), Distortion(k1=-90), "frame 3"
+            np.zeros((9, 9, 4), np.float32), np.array([5.0, 5, 4.5, 4.5]), LensDistortion(k1=-90), "frame 3"
         )
 
 
@@ -123,7 +125,7 @@ def test_a_scene_taken_through_a_lens(tmp_path: Path) -> None:
     sharp[..., 3] = 1
     rows, columns = np.mgrid[: size * fine, : size * fine] + 0.5
     x, y = (columns / fine - size / 2) / focal, (rows / fine - size / 2) / focal
-    u, v = inverse(Distortion(**lens), x, y)
+    u, v = inverse(LensDistortion(**lens), x, y)
     place = [(v * focal + size / 2) * fine - 0.5, (u * focal + size / 2) * fine - 0.5]
     bent = np.stack(
         [map_coordinates(sharp[..., c], place, order=1, mode="nearest") for c in range(4)], axis=-1
@@ -145,7 +147,7 @@ def test_a_scene_taken_through_a_lens(tmp_path: Path) -> None:
 
 
 class TestOrientation:
-    """A picture of 4x6 whose pixels differ, stored turned in all the ways that EXIF knows."""
+    """An image of 4x6 whose pixels differ, stored turned in all the ways that EXIF knows."""
 
     pixels = np.random.default_rng(0).integers(0, 256, (6, 4, 4), dtype=np.uint8)
     # For orientation k: how an upright array is stored (EXIF 2.3, tag 274).
@@ -167,7 +169,7 @@ class TestOrientation:
         Image.fromarray(array).save(path, exif=exif)
 
     @pytest.mark.parametrize("orientation", range(1, 9))
-    def test_pictures_are_turned_upright(self, tmp_path: Path, orientation: int) -> None:
+    def test_images_are_turned_upright(self, tmp_path: Path, orientation: int) -> None:
         self.save(tmp_path / "a.png", orientation)
         expected = (self.pixels / 255).astype(np.float32)
         np.testing.assert_array_equal(read_rgba(tmp_path / "a.png"), expected)
@@ -217,8 +219,8 @@ def test_masks(tmp_path: Path) -> None:
         read_mask(tmp_path / "grey.png")
 
 
-def test_turned_pictures_of_a_scene(tmp_path: Path) -> None:
-    """Pictures stored sideways load as the upright ones they came from."""
+def test_turned_images_of_a_scene(tmp_path: Path) -> None:
+    """Images stored sideways load as the upright ones they came from."""
     source = builtin_scene(tmp_path, size=16)
     expected = load_scene(source, "builtin8")
     turned: Any = shutil.copytree(source, tmp_path / "turned")

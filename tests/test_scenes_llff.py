@@ -84,11 +84,11 @@ def refused(folder: Path, pattern: str, **options: Any) -> None:
 
 
 class TestBadInput:
-    def test_number_of_pictures(self, scene: Path) -> None:
+    def test_number_of_images(self, scene: Path) -> None:
         (scene / "images/IMG_03.JPG").unlink()
-        refused(scene, r"poses_bounds\.npy: holds 9 poses, but .*images holds 8 pictures")
+        refused(scene, r"poses_bounds\.npy: holds 9 poses, but .*images holds 8 images")
         shutil.rmtree(scene / "images")
-        refused(scene, r"holds 9 poses, but .*images holds 0 pictures")
+        refused(scene, r"holds 9 poses, but .*images holds 0 images")
 
     def test_size(self, scene: Path) -> None:
         Image.new("RGB", (HEIGHT, WIDTH)).save(scene / "images/IMG_03.JPG")

@@ -1,4 +1,4 @@
-"""`prepare`: from pictures or found cameras to a scene folder, whole or not at all."""
+"""`prepare`: from images or found cameras to a scene folder, whole or not at all."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ def turned(degrees: float) -> np.ndarray:
 
 @pytest.fixture
 def posed(source: Path, tmp_path: Path) -> Path:
-    """The built-in training pictures with their cameras in a world that is turned, shifted and 5 times larger."""
+    """The built-in training images with their cameras in a world that is turned, shifted and 5 times larger."""
     folder = tmp_path / "posed"
-    shutil.copytree(source / "train", folder / "pictures")
+    shutil.copytree(source / "train", folder / "images")
     content = json.loads((source / "transforms_train.json").read_text())
     for k, frame in enumerate(content["frames"]):
         pose = turned(50) @ np.array(frame["transform_matrix"])
         pose[:3, 3] = 5 * (pose[:3, 3] - [7, -4, 2]) + [7, -4, 2]
-        frame.update(file_path=f"pictures/r_{k}.png", transform_matrix=pose.tolist())
+        frame.update(file_path=f"images/r_{k}.png", transform_matrix=pose.tolist())
     (folder / "transforms.json").write_text(json.dumps(content))
     return folder
 
@@ -80,7 +80,7 @@ class TestFromCameras:
 
     def test_reports_in_two_lines(self, posed: Path, tmp_path: Path) -> None:
         first, second = str(prepare(posed, tmp_path / "out")).split("\n")
-        assert first.endswith("out: 18 of 18 pictures have cameras")
+        assert first.endswith("out: 18 of 18 images have cameras")
         assert second.startswith("near ")
         assert second.endswith("out/cameras.png")
         drawing = np.asarray(Image.open(tmp_path / "out/cameras.png").convert("RGB")).astype(int)
@@ -92,7 +92,7 @@ class TestFromCameras:
     def test_keeps_lenses_and_masks(self, posed: Path, tmp_path: Path) -> None:
         content = json.loads((posed / "transforms.json").read_text())
         content.update(fl_x=21.0, fl_y=22.0, cx=8.5, cy=7.5, w=SIZE, h=SIZE, k1=0.1, p2=0.01)
-        content["frames"][3]["mask_path"] = "pictures/r_5.png"
+        content["frames"][3]["mask_path"] = "images/r_5.png"
         content["frames"][4]["fl_x"] = 23.0
         (posed / "transforms.json").write_text(json.dumps(content))
         prepare(posed, tmp_path / "out")
@@ -104,7 +104,7 @@ class TestFromCameras:
         torch.testing.assert_close(after.train.rgba, rgba[rows])
         torch.testing.assert_close(after.train.intrinsics, intrinsics[rows])
 
-    def test_reduces_large_pictures_with_their_cameras_and_masks(self, posed: Path, tmp_path: Path) -> None:
+    def test_reduces_large_images_with_their_cameras_and_masks(self, posed: Path, tmp_path: Path) -> None:
         content = json.loads((posed / "transforms.json").read_text())
         content.update(fl_x=21.0, fl_y=22.0, cx=8.5, cy=7.5, w=SIZE, h=SIZE)
         (posed / "transforms.json").write_text(json.dumps(content))
@@ -113,9 +113,9 @@ class TestFromCameras:
             mask = np.zeros((SIZE, SIZE), dtype=np.uint8)
             mask[:, : SIZE // 2] = 255
             Image.fromarray(mask).convert("1").save(tmp_path / f"masks/r_{k}.png")
-            picture = np.zeros((SIZE, SIZE, 3), dtype=np.uint8)
-            picture[: SIZE // 2], picture[1::2, :, 1] = (10 * k, 0, 200), 100
-            Image.fromarray(picture).save(posed / f"pictures/r_{k}.png")
+            image = np.zeros((SIZE, SIZE, 3), dtype=np.uint8)
+            image[: SIZE // 2], image[1::2, :, 1] = (10 * k, 0, 200), 100
+            Image.fromarray(image).save(posed / f"images/r_{k}.png")
         prepare(posed, tmp_path / "out", masks=tmp_path / "masks", longest_edge=SIZE // 2)
         prepare(posed, tmp_path / "same", masks=tmp_path / "masks", longest_edge=SIZE)
         small, large = load_scene(tmp_path / "out", "holdout8"), load_scene(tmp_path / "same", "holdout8")
@@ -136,19 +136,19 @@ class TestFromCameras:
         (tmp_path / "masks/r_9.png").unlink()
         refused(posed, tmp_path / "again", r"no mask for image r_9\.png", masks=tmp_path / "masks")
 
-    def test_two_pictures_of_one_name(self, posed: Path, tmp_path: Path) -> None:
+    def test_two_images_of_one_name(self, posed: Path, tmp_path: Path) -> None:
         (posed / "more").mkdir()
-        shutil.move(posed / "pictures/r_1.png", posed / "more/r_0.png")
+        shutil.move(posed / "images/r_1.png", posed / "more/r_0.png")
         content = json.loads((posed / "transforms.json").read_text())
         content["frames"][1]["file_path"] = "more/r_0.png"
         (posed / "transforms.json").write_text(json.dumps(content))
         prepared = prepare(posed, tmp_path / "out")
-        assert {"more_r_0.png", "pictures_r_0.png"} <= set(prepared.registered)
+        assert {"more_r_0.png", "images_r_0.png"} <= set(prepared.registered)
 
     def test_what_needs_no_preparation(self, source: Path, tmp_path: Path) -> None:
         refused(source, tmp_path / "out", "needs no preparation, load it as it is")
 
-    def test_a_damaged_scene_is_not_taken_for_pictures(self, posed: Path, tmp_path: Path) -> None:
+    def test_a_damaged_scene_is_not_taken_for_images(self, posed: Path, tmp_path: Path) -> None:
         (posed / "transforms.json").write_text("{")
         refused(posed, tmp_path / "out", r"transforms\.json: not valid JSON")
 
@@ -168,7 +168,7 @@ class TestFolders:
         assert (tmp_path / "out").read_text() == "mine"
 
     def test_no_source(self, tmp_path: Path) -> None:
-        refused(tmp_path / "nothing", tmp_path / "out", "nothing: no such folder of pictures")
+        refused(tmp_path / "nothing", tmp_path / "out", "nothing: no such folder of images")
 
     def test_unwritable(self, posed: Path, tmp_path: Path) -> None:
         (tmp_path / "file").write_text("")

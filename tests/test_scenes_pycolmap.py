@@ -1,4 +1,4 @@
-"""pycolmap on pictures of the built-in object: the cameras that took them are found again."""
+"""pycolmap on images of the built-in object: the cameras that took them are found again."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def wall_textures() -> np.ndarray:
     return np.clip(0.5 + 5 * (blurred - 0.5), 0, 1)
 
 
-def room_picture(pose: np.ndarray, intrinsics: np.ndarray, size: int, textures: np.ndarray) -> np.ndarray:
+def room_image(pose: np.ndarray, intrinsics: np.ndarray, size: int, textures: np.ndarray) -> np.ndarray:
     """The lighthouse in a room with these textures on its walls, floor and ceiling."""
     rgba = render_rgba(pose, intrinsics, size, size, samples=2)
     hits = cast(pose, intrinsics, np.arange(size) + 0.5, np.arange(size) + 0.5)
@@ -45,12 +45,12 @@ def test_pycolmap_finds_the_cameras(tmp_path: Path) -> None:
     focal = 0.5 * size / np.tan(0.5 * 0.8)
     intrinsics = np.array([focal, focal, size / 2, size / 2])
     poses = [look_at_origin(14 * k, 18 + 6 * np.sin(k)) for k in range(8)]
-    (tmp_path / "pictures").mkdir()
+    (tmp_path / "images").mkdir()
     textures = wall_textures()
     for k, pose in enumerate(poses):
-        pixels = np.rint(255 * room_picture(pose, intrinsics, size, textures)).astype(np.uint8)
-        Image.fromarray(pixels).save(tmp_path / f"pictures/{k}.png")
-    prepared = prepare(tmp_path / "pictures", tmp_path / "out")
+        pixels = np.rint(255 * room_image(pose, intrinsics, size, textures)).astype(np.uint8)
+        Image.fromarray(pixels).save(tmp_path / f"images/{k}.png")
+    prepared = prepare(tmp_path / "images", tmp_path / "out")
     assert len(prepared.registered) >= 7
     scene = load_scene(tmp_path / "out", "holdout8")
     views = (scene.train, scene.test)

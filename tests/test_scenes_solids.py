@@ -10,13 +10,13 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gridreg.scenes.builtin.solids import Ball, Block, Frustum, Solid
+from gridreg.scenes.builtin.solids import Ball, Cuboid, Frustum, Solid
 from gridreg.scenes.builtin.tessellate import tessellate
 
 lengths = st.floats(0.05, 1.5)
 solids = st.one_of(
     st.builds(Ball, lengths),
-    st.builds(lambda x, y, z: Block((x, y, z)), lengths, lengths, lengths),
+    st.builds(lambda x, y, z: Cuboid((x, y, z)), lengths, lengths, lengths),
     st.builds(Frustum, lengths, lengths, lengths),
     st.builds(lambda r, h: Frustum(r, r, h), lengths, lengths),
     st.builds(lambda r, h: Frustum(r, 0.0, h), lengths, lengths),
@@ -86,7 +86,7 @@ class TestSolids:
         side = cone.sample(40_000, rng)[:, 2]
         # The area of a cone's side above height h is (1 - h)^2 of the whole.
         assert (side[side > 0] > 0.5).mean() == pytest.approx(0.25, abs=0.01)
-        box = Block((1.0, 0.5, 0.25)).sample(40_000, rng)
+        box = Cuboid((1.0, 0.5, 0.25)).sample(40_000, rng)
         assert (np.abs(box[:, 2]) == 0.25).mean() == pytest.approx(0.5 / 0.875, abs=0.01)
 
     def test_no_tessellation_for_others(self) -> None:

@@ -61,7 +61,7 @@ def test_every_eighth_frame_is_held_out(scene: Path, source: Path) -> None:
     assert torch.equal(loaded.test.intrinsics, original.intrinsics[:3])
 
 
-def test_pictures_need_no_alpha_here(scene: Path) -> None:
+def test_images_need_no_alpha_here(scene: Path) -> None:
     for k in range(18):
         Image.open(scene / f"images/r_{k}.png").convert("RGB").save(scene / f"images/r_{k}.png")
     assert bool((load_scene(scene, "holdout8").train.rgba[..., 3] == 1).all())
@@ -115,7 +115,7 @@ def test_masks_named_by_the_frames(scene: Path) -> None:
     refused(scene, r"frame 1: mask_path is a int, expected a string")
 
 
-def test_pictures_of_different_sizes_with_one_intrinsics(scene: Path) -> None:
+def test_images_of_different_sizes_with_one_intrinsics(scene: Path) -> None:
     Image.new("RGBA", (12, SIZE)).save(scene / "images/r_5.png")
     refused(scene, r"images/r_5\.png: image is 12x16, expected 16x16 as before")
     edit(scene, lambda c: c.update(w=SIZE, h=SIZE))

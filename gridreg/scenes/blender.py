@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from gridreg.errors import InputError
-from gridreg.scenes.frames import Camera, Frame, SceneFiles, check_pose
-from gridreg.scenes.lens import Distortion
+from gridreg.scenes.frames import Frame, SceneFiles, StatedIntrinsics, check_pose
+from gridreg.scenes.lens import LensDistortion
 
 __all__ = ["read_blender", "read_camera", "read_frames", "read_json"]
 
@@ -81,7 +81,7 @@ def _read_frame(shared: dict[str, Any], entry: object, where: str) -> Frame:
     return Frame(entry["file_path"], pose, camera, where, mask_path)
 
 
-def read_camera(values: dict[str, Any], where: str) -> Camera:
+def read_camera(values: dict[str, Any], where: str) -> StatedIntrinsics:
     """Read intrinsics by the keys of nerf_synthetic and instant-ngp.
 
     Raises:
@@ -90,7 +90,7 @@ def read_camera(values: dict[str, Any], where: str) -> Camera:
     lens = values.get("camera_model", "FISHEYE" if values.get("is_fisheye") else "OPENCV")
     if not isinstance(lens, str) or lens.upper() not in _LENSES:
         raise InputError(f"{where}: camera_model is {lens!r}, expected one of {', '.join(_LENSES)}")
-    distortion = Distortion(**{key: _number(values, key, where) or 0.0 for key in _DISTORTION})
+    distortion = LensDistortion(**{key: _number(values, key, where) or 0.0 for key in _DISTORTION})
     angle = _number(values, "camera_angle_x", where)
     fx, fy = _number(values, "fl_x", where), _number(values, "fl_y", where)
     if fx is None and angle is None:
@@ -104,7 +104,7 @@ def read_camera(values: dict[str, Any], where: str) -> Camera:
     for key, edge in (("w", width), ("h", height)):
         if edge is not None and (edge < 1 or edge != round(edge)):
             raise InputError(f"{where}: {key} is {edge}, expected a whole number of pixels")
-    return Camera(
+    return StatedIntrinsics(
         angle_x=angle,
         fx=fx,
         fy=fy,

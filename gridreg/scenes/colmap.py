@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from gridreg.errors import InputError
 from gridreg.scenes.colmap_model import ColmapCamera, ColmapImage, ColmapModel, read_model
-from gridreg.scenes.frames import Camera, Frame, SceneFiles, check_pose
-from gridreg.scenes.lens import Distortion
+from gridreg.scenes.frames import Frame, SceneFiles, StatedIntrinsics, check_pose
+from gridreg.scenes.lens import LensDistortion
 
 __all__ = ["camera_to_world", "find_models", "frames_of_model", "mask_of", "read_colmap"]
 
@@ -40,17 +40,17 @@ def read_colmap(folder: Path) -> SceneFiles:
     called like its image, with the same extension or ``.png``, or like its image with ``.png`` appended.
 
     Raises:
-        InputError: when there is more than one model, or it or its pictures cannot be read.
+        InputError: when there is more than one model, or it or its images cannot be read.
     """
     models = find_models(folder)
     if len(models) != 1:
         found = ", ".join(str(model.relative_to(folder)) for model in models) or "none"
         raise InputError(f"{folder}: expected one COLMAP model, found {found}; leave only the one to use")
     model = read_model(models[0])
-    pictures = next((name for name in ("images", "input") if (folder / name).is_dir()), None)
-    if pictures is None:
-        raise InputError(f"{folder}: folder images/ with the pictures of the COLMAP model not found")
-    frames = frames_of_model(model, folder, pictures, str(models[0]))
+    images = next((name for name in ("images", "input") if (folder / name).is_dir()), None)
+    if images is None:
+        raise InputError(f"{folder}: folder images/ with the images of the COLMAP model not found")
+    frames = frames_of_model(model, folder, images, str(models[0]))
     return SceneFiles.held_out(
         folder,
         frames,
@@ -61,8 +61,8 @@ def read_colmap(folder: Path) -> SceneFiles:
     )
 
 
-def frames_of_model(model: ColmapModel, folder: Path, pictures: str, where: str) -> list[Frame]:
-    """Turn a model's images into frames whose paths start with ``pictures``.
+def frames_of_model(model: ColmapModel, folder: Path, images: str, where: str) -> list[Frame]:
+    """Turn a model's images into frames whose paths start with ``images``.
 
     Raises:
         InputError: for a rotation that is none, or a mask that is missing where others are there.
@@ -70,7 +70,7 @@ def frames_of_model(model: ColmapModel, folder: Path, pictures: str, where: str)
     masks = folder / "masks"
     return [
         Frame(
-            file_path=f"{pictures}/{image.name}",
+            file_path=f"{images}/{image.name}",
             pose=camera_to_world(image, f"{where}: image {image.name}"),
             camera=_to_camera(model.cameras[image.camera_id]),
             where=f"{where}: image {image.name}",
@@ -106,18 +106,18 @@ def camera_to_world(image: ColmapImage, where: str) -> NDArray[np.float64]:
     return check_pose(pose, where)
 
 
-def _to_camera(camera: ColmapCamera) -> Camera:
+def _to_camera(camera: ColmapCamera) -> StatedIntrinsics:
     values = camera.parameters
     fx = values.get("fx", values.get("f"))
     lens = {key: value for key, value in values.items() if key[0] in "kp"}
-    return Camera(
+    return StatedIntrinsics(
         fx=fx,
         fy=values.get("fy", fx),
         cx=values["cx"],
         cy=values["cy"],
         width=camera.width,
         height=camera.height,
-        distortion=Distortion(**lens),
+        distortion=LensDistortion(**lens),
     )
 
 

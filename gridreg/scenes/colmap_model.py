@@ -41,7 +41,7 @@ class ColmapCamera:
 
 @dataclass(frozen=True)
 class ColmapImage:
-    """A registered picture: world-to-camera quaternion (w, x, y, z) and translation, camera y down."""
+    """A registered image: world-to-camera quaternion (w, x, y, z) and translation, camera y down."""
 
     name: str
     camera_id: int

@@ -1,4 +1,4 @@
-"""A picture of the cameras of a scene, the box that holds it, and what is known of its surface."""
+"""A drawing of the cameras of a scene, the box that holds it, and what is known of its surface."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where to look: near, far and bounding box, by convention or from the cameras."""
+"""Bounds of a scene: near, far and bounding box, by convention or from the cameras."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ def check_box(scene: Scene, points: NDArray[np.float64] | None = None) -> None:
 def box_is_seen(
     extent: Extent, poses: NDArray[np.float64], intrinsics: NDArray[np.float64], size: tuple[int, int]
 ) -> bool:
-    """Whether any camera sees some of a box between near and far.
+    """Tell whether any camera sees some of a box between near and far.
 
     Args:
         extent: the box, near and far.
@@ -170,7 +170,7 @@ def _sees_points(
     extent: Extent,
     size: tuple[int, int],
 ) -> bool:
-    """Whether any of the points lies in the image, between near and far: finds small boxes."""
+    """Tell whether any of the points lies in the image, between near and far: finds small boxes."""
     local = (points - pose[:3, 3]) @ pose[:3, :3]
     depth = -local[:, 2]
     safe = np.maximum(depth, 1e-9)
@@ -185,7 +185,7 @@ def _sees_points(
 def _meets_box(
     pose: NDArray[np.float64], values: NDArray[np.float64], extent: Extent, size: tuple[int, int]
 ) -> bool:
-    """Whether a ray of a coarse grid of pixels meets the box between near and far: finds large boxes."""
+    """Tell whether a ray of a coarse grid of pixels meets the box between near and far: finds large boxes."""
     low, high = extent.bounds
     columns, rows = np.meshgrid(np.linspace(0, size[0], 17), np.linspace(0, size[1], 17))
     local = np.stack(

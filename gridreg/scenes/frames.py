@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 
 from gridreg.errors import InputError
 from gridreg.scenes.extent import Extent
-from gridreg.scenes.lens import NO_DISTORTION, Distortion
+from gridreg.scenes.lens import NO_DISTORTION, LensDistortion
 
-__all__ = ["Camera", "Frame", "SceneFiles", "check_pose", "resolve_inside"]
+__all__ = ["StatedIntrinsics", "Frame", "SceneFiles", "check_pose", "resolve_inside"]
 
 _EXTENSIONS = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 
 
 @dataclass(frozen=True)
-class Camera:
+class StatedIntrinsics:
     """Intrinsics as a file states them; what it leaves out follows from the image's size.
 
     Attributes:
@@ -38,7 +38,7 @@ class Camera:
     cy: float | None = None
     width: int | None = None
     height: int | None = None
-    distortion: Distortion = NO_DISTORTION
+    distortion: LensDistortion = NO_DISTORTION
 
     @property
     def size(self) -> tuple[int, int] | None:
@@ -72,7 +72,7 @@ class Frame:
 
     file_path: str
     pose: NDArray[np.float64]
-    camera: Camera
+    camera: StatedIntrinsics
     where: str
     mask_path: str | None = None
 

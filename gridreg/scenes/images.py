@@ -199,7 +199,7 @@ def copy_upright(
 
 
 def _lens_notes(image: Image.Image) -> Image.Exif:
-    """Of a picture's EXIF data what tells the focal length in pixels: structure from motion starts from it."""
+    """Return the part of the EXIF data that tells the focal length: structure from motion starts from it."""
     old, new = image.getexif(), Image.Exif()
     new.update({tag: old[tag] for tag in (ExifTags.Base.Make, ExifTags.Base.Model) if tag in old})
     noted = old.get_ifd(ExifTags.IFD.Exif)

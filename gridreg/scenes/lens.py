@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 
 from gridreg.errors import InputError
 
-__all__ = ["NO_DISTORTION", "Distortion", "undistort"]
+__all__ = ["NO_DISTORTION", "LensDistortion", "undistort"]
 
 Array = NDArray[np.float64]
 _STRONGEST_ZOOM = 4.0
 
 
 @dataclass(frozen=True)
-class Distortion:
+class LensDistortion:
     """Coefficients of OpenCV's lens model; all zero is a pinhole.
 
     Attributes:
@@ -51,12 +51,12 @@ class Distortion:
         )
 
 
-NO_DISTORTION = Distortion()
+NO_DISTORTION = LensDistortion()
 """A pinhole."""
 
 
 def undistort(
-    image: NDArray[np.float32], intrinsics: Array, distortion: Distortion, where: str
+    image: NDArray[np.float32], intrinsics: Array, distortion: LensDistortion, where: str
 ) -> tuple[NDArray[np.float32], Array]:
     """Resample an image (bilinearly) to a pinhole of the same size and principal point.
 
@@ -91,7 +91,7 @@ def _centres(count: int) -> Array:
 
 
 def _source(
-    columns: Array, rows: Array, pinhole: Array, intrinsics: Array, distortion: Distortion
+    columns: Array, rows: Array, pinhole: Array, intrinsics: Array, distortion: LensDistortion
 ) -> tuple[Array, Array]:
     """Return the coordinates in the original of points of the pinhole image."""
     x, y = np.broadcast_arrays((columns - pinhole[2]) / pinhole[0], (rows - pinhole[3]) / pinhole[1])
@@ -99,7 +99,7 @@ def _source(
     return x * intrinsics[0] + intrinsics[2], y * intrinsics[1] + intrinsics[3]
 
 
-def _least_zoom(intrinsics: Array, distortion: Distortion, width: int, height: int, where: str) -> float:
+def _least_zoom(intrinsics: Array, distortion: LensDistortion, width: int, height: int, where: str) -> float:
     across, along = _centres(width), _centres(height)
     columns = np.concatenate([across, across, np.full(height, 0.5), np.full(height, width - 0.5)])
     rows = np.concatenate([np.full(width, 0.5), np.full(width, height - 0.5), along, along])
@@ -107,9 +107,11 @@ def _least_zoom(intrinsics: Array, distortion: Distortion, width: int, height: i
     def inside(zoom: float) -> bool:
         # The whole way from the axis to the border counts: past its turning point a lens folds back.
         u, v = columns[:, None] - intrinsics[2], rows[:, None] - intrinsics[3]
-        share = np.linspace(0, 1, 17)
+        fraction = np.linspace(0, 1, 17)
         pinhole = intrinsics * [zoom, zoom, 1, 1]
-        x, y = _source(intrinsics[2] + share * u, intrinsics[3] + share * v, pinhole, intrinsics, distortion)
+        x, y = _source(
+            intrinsics[2] + fraction * u, intrinsics[3] + fraction * v, pinhole, intrinsics, distortion
+        )
         fits = (x >= 0.5 - 1e-6) & (x <= width - 0.5 + 1e-6) & (y >= 0.5 - 1e-6) & (y <= height - 0.5 + 1e-6)
         outward = np.diff((x - intrinsics[2]) * u + (y - intrinsics[3]) * v, axis=1) > 0
         return bool(fits.all() and outward.all())

@@ -15,30 +15,30 @@ from torch import Tensor
 
 from gridreg.errors import InputError
 from gridreg.scenes.extent import Extent
-from gridreg.scenes.frames import Camera, Frame, SceneFiles, check_pose
+from gridreg.scenes.frames import Frame, SceneFiles, StatedIntrinsics, check_pose
 
 __all__ = ["ndc_rays", "read_llff"]
 
-_PICTURES = (".jpg", ".jpeg", ".png")
+_IMAGES = (".jpg", ".jpeg", ".png")
 # x and y reach a little past the image's edge at the near plane; z = -1 is the near plane, z = 1 infinity.
 _NDC_BOX = ((-1.5, -1.67, -1.0), (1.5, 1.67, 1.0))
 
 
 def read_llff(folder: Path) -> SceneFiles:
-    """Read ``poses_bounds.npy`` and the list of pictures in ``images/`` without opening one.
+    """Read ``poses_bounds.npy`` and the list of images in ``images/`` without opening one.
 
     As in NeRF, the world is scaled so that the nearest depth becomes 4/3, and centred on the average
     camera, which then looks along -z; the near plane of the normalised coordinates lies at depth 1.
 
     Raises:
-        InputError: for a missing or malformed file, or a number of pictures that is not that of the poses.
+        InputError: for a missing or malformed file, or a number of images that is not that of the poses.
     """
     path = folder / "poses_bounds.npy"
     rows = _read_rows(path)
-    pictures = sorted(p.name for p in (folder / "images").glob("*") if p.suffix.lower() in _PICTURES)
-    if len(pictures) != len(rows):
+    images = sorted(p.name for p in (folder / "images").glob("*") if p.suffix.lower() in _IMAGES)
+    if len(images) != len(rows):
         raise InputError(
-            f"{path}: holds {len(rows)} poses, but {folder / 'images'} holds {len(pictures)} pictures"
+            f"{path}: holds {len(rows)} poses, but {folder / 'images'} holds {len(images)} images"
         )
     matrices = rows[:, :15].reshape(-1, 3, 5)
     # LLFF's columns are down, right, back; ours are right, up, back.
@@ -48,10 +48,10 @@ def read_llff(folder: Path) -> SceneFiles:
     poses[:, :3, 3] *= scale
     poses = np.linalg.inv(_average_pose(poses)) @ poses
     frames = []
-    for i, (picture, pose) in enumerate(zip(pictures, poses, strict=True)):
+    for i, (image, pose) in enumerate(zip(images, poses, strict=True)):
         height, width, focal = matrices[i, :, 4]
-        camera = Camera(fx=focal, width=round(width), height=round(height))
-        frames.append(Frame(f"images/{picture}", pose, camera, f"{path}: pose {i}"))
+        camera = StatedIntrinsics(fx=focal, width=round(width), height=round(height))
+        frames.append(Frame(f"images/{image}", pose, camera, f"{path}: pose {i}"))
     bounds = np.array(_NDC_BOX)
     far = float(np.linalg.norm(bounds[1] - bounds[0]))
     return SceneFiles.held_out(

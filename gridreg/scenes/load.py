@@ -52,7 +52,7 @@ def load_scene(
         test: indices into the test frames instead of the protocol's; an empty one reads none.
         validation: indices into the training frames, or how many to take, evenly spread, of those that the
             protocol does not train on.
-        background: instead of the protocol's, and of the one colour that opaque pictures may have along their edges.
+        background: instead of the protocol's, and of the one colour that opaque images may have along their edges.
         near: world units, instead of what the format or the cameras say.
         far: likewise.
         bounds: ``(2, 3)`` lower and upper corner, likewise.

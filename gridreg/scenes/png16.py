@@ -15,7 +15,7 @@ _CHANNELS = {2: 3, 6: 4}
 
 
 def is_png16(data: bytes) -> bool:
-    """Whether ``data`` opens as a 16-bit RGB or RGBA PNG without interlacing."""
+    """Tell whether ``data`` opens as a 16-bit RGB or RGBA PNG without interlacing."""
     if len(data) < 29 or not data.startswith(_SIGNATURE) or data[12:16] != b"IHDR":
         return False
     depth, colour_type, _, _, interlace = data[24:29]

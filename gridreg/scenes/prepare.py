@@ -1,4 +1,4 @@
-"""`prepare`: from pictures, or cameras that another program found, to a scene folder to train on."""
+"""`prepare`: from images, or cameras that another program found, to a scene folder to train on."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from PIL import Image
 from gridreg.errors import InputError
 from gridreg.scenes.drawing import draw_cameras
 from gridreg.scenes.extent import Extent, box_is_seen, camera_extent, points_extent
-from gridreg.scenes.frames import Camera, Frame
+from gridreg.scenes.frames import Frame, StatedIntrinsics
 from gridreg.scenes.load import NotASceneError, read_folder
-from gridreg.scenes.own_pictures import (
+from gridreg.scenes.own_images import (
     attach_masks,
     copy_frames,
-    copy_pictures,
+    copy_images,
     find_cameras,
-    shrink_pictures,
+    shrink_images,
 )
 from gridreg.scenes.transforms import EXTENT_KEY
 
@@ -37,14 +37,14 @@ _HALF_EDGE = 1.3
 
 @dataclass(frozen=True)
 class Prepared:
-    """What :func:`prepare` made; printed, it says so in two lines.
+    """Result of :func:`prepare`; printed, it is described in two lines.
 
     Attributes:
         folder: the scene folder.
-        registered: names of the pictures that have a camera.
-        missing: names of the pictures that have none.
+        registered: names of the images that have a camera.
+        missing: names of the images that have none.
         extent: near, far and box, world units.
-        drawing: the picture of cameras and box.
+        drawing: the drawing of cameras and box.
     """
 
     folder: Path
@@ -58,7 +58,7 @@ class Prepared:
         total = len(self.registered) + len(self.missing)
         without = f" (not {', '.join(self.missing)})" if self.missing else ""
         return (
-            f"{self.folder}: {len(self.registered)} of {total} pictures have cameras{without}\n"
+            f"{self.folder}: {len(self.registered)} of {total} images have cameras{without}\n"
             f"near {self.extent.near:.3f}, far {self.extent.far:.3f}, box {low} to {high}; see {self.drawing}"
         )
 
@@ -74,33 +74,33 @@ def prepare(
     longest_edge: int = 800,
     progress: Callable[[str], None] = lambda stage: None,
 ) -> Prepared:
-    """Make a scene folder: upright pictures, ``transforms.json``, and a drawing of the cameras and the box.
+    """Make a scene folder: upright images, ``transforms.json``, and a drawing of the cameras and the box.
 
     The world is turned so that the cameras' mean up is z, centred on the box, and scaled so that the box
     reaches 1.3 to each side, the size at which the presets are at home. Near, far and box are written along
     and can be overridden when the scene is loaded.
 
     Args:
-        source: a folder of pictures (JPEG or PNG, one size; pycolmap finds the cameras), or a scene whose
+        source: a folder of images (JPEG or PNG, one size; pycolmap finds the cameras), or a scene whose
             cameras COLMAP, nerfstudio or instant-ngp found.
         out: the scene folder to make; must not exist.
-        masks: folder with a mask for every picture (white is kept), which becomes its alpha: called like the
-            picture, with the extension ``.png`` instead of its own or after it.
+        masks: folder with a mask for every image (white is kept), which becomes its alpha: called like the
+            image, with the extension ``.png`` instead of its own or after it.
         near: distance from a camera where looking begins, world units of the made scene, instead of the derived one.
         far: distance from a camera where looking ends, likewise.
         bounds: ``(2, 3)`` lower and upper corner, likewise; the world stays turned, centred and scaled as derived.
-        longest_edge: pixels; larger pictures are reduced (by area) once their cameras are known, as the photographs
+        longest_edge: pixels; larger images are reduced (by area) once their cameras are known, as the photographs
             of a telephone would fill the memory and show no more than the grid can hold.
         progress: called with the name of each stage.
 
     Raises:
-        InputError: for no, damaged or differently sized pictures, too few that could be registered, pycolmap
+        InputError: for no, damaged or differently sized images, too few that could be registered, pycolmap
             missing, a mask missing, near, far or box that hold nothing, or a folder ``out`` that exists or
             cannot be written.
     """
     source, out = Path(source), Path(out)
     if not source.is_dir():
-        raise InputError(f"{source}: no such folder of pictures")
+        raise InputError(f"{source}: no such folder of images")
     if out.exists():
         raise InputError(f"{out}: exists already, expected the name of a new folder")
     if longest_edge < 8:
@@ -132,11 +132,11 @@ def prepare(
 def _gather(
     source: Path, scene: Path, scratch: Path, progress: Callable[[str], None]
 ) -> tuple[list[Frame], Array | None, list[str]]:
-    """Fill ``scene/images``; return frames, points and the names of all pictures."""
+    """Fill ``scene/images``; return frames, points and the names of all images."""
     try:
         files = read_folder(source)
     except NotASceneError:
-        names = copy_pictures(source, scene)
+        names = copy_images(source, scene)
         frames, points = find_cameras(scene, names, scratch, progress)
         return frames, points, names
     if files.ndc or not files.split_here:
@@ -187,7 +187,7 @@ def _write(
         )
     frames = [replace(frame, pose=pose) for frame, pose in zip(frames, poses, strict=True)]
     content = {EXTENT_KEY: {"near": extent.near, "far": extent.far, "bounds": extent.bounds.tolist()}}
-    reduced = shrink_pictures(frames, scene, size, longest_edge)
+    reduced = shrink_images(frames, scene, size, longest_edge)
     cameras = [_camera_keys(frame.camera, size, reduced) for frame in frames]
     shared = cameras[0] if all(camera == cameras[0] for camera in cameras) else {}
     listed = [
@@ -219,8 +219,8 @@ def _upwards(up: Array) -> Array:
     return np.asarray(np.eye(3) + cross + cross @ cross / (1 + z))
 
 
-def _camera_keys(camera: Camera, size: tuple[int, int], reduced: tuple[int, int]) -> dict[str, Any]:
-    """A camera of pictures of ``size`` that are now ``reduced``."""
+def _camera_keys(camera: StatedIntrinsics, size: tuple[int, int], reduced: tuple[int, int]) -> dict[str, Any]:
+    """Return the keys of a camera for images of ``size`` that are now ``reduced``."""
     fx, fy, cx, cy = camera.intrinsics(*size)
     x, y = reduced[0] / size[0], reduced[1] / size[1]
     lens = {key: value for key, value in asdict(camera.distortion).items() if value}

@@ -106,8 +106,8 @@ class KMeans:
         while len(centres) < self.count:
             gap = _squared_distances(positions, centres).min(axis=1)
             # Cameras at one place leave nothing to spread over: any of them is as good.
-            share = gap / gap.sum() if gap.sum() > 0 else np.full(len(gap), 1 / len(gap))
-            centres = np.concatenate([centres, positions[[int(rng.choice(len(positions), p=share))]]])
+            fraction = gap / gap.sum() if gap.sum() > 0 else np.full(len(gap), 1 / len(gap))
+            centres = np.concatenate([centres, positions[[int(rng.choice(len(positions), p=fraction))]]])
         for _ in range(100):
             nearest = _squared_distances(positions, centres).argmin(axis=1)
             moved = np.stack(
@@ -159,7 +159,7 @@ class Protocol:
 
 
 VALIDATION_VIEWS = 10
-"""How many views a ``-validation`` protocol scores."""
+"""Number of views that a ``-validation`` protocol scores."""
 
 _SUFFIX = "-validation"
 _DIETNERF = Listed((26, 86, 2, 55, 75, 93, 16, 73))
@@ -181,7 +181,7 @@ PROTOCOLS: dict[str, Protocol] = {
         Protocol(
             "builtin8", First(8), Every(1), None, "white", "the built-in scene; not a published benchmark"
         ),
-        Protocol("holdout8", Every(1), Every(1), None, "white", "own pictures and LLFF: every 8th held out"),
+        Protocol("holdout8", Every(1), Every(1), None, "white", "own images and LLFF: every 8th held out"),
     )
 }
 """The protocols by name; :func:`get_protocol` knows the counted forms as well."""

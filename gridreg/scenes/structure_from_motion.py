@@ -1,4 +1,4 @@
-"""Cameras of pictures by pycolmap, as a program of its own: ``python structure_from_motion.py PICTURES OUT``.
+"""Cameras of images by pycolmap, as a program of its own: ``python structure_from_motion.py IMAGES OUT``.
 
 It runs apart from the rest because pycolmap brings image libraries along that clash with Pillow's inside one
 process (memory is corrupted), and because native code that aborts must not take the caller with it. So it
@@ -11,37 +11,37 @@ import sys
 from pathlib import Path
 from typing import Any
 
-# Share of the pictures above which a second attempt is not worth its time.
+# Fraction of the images above which a second attempt is not worth its time.
 _ENOUGH = 0.9
-# Of adjusting and finding points anew: on the pictures of benchmarks/own_pictures.py a third changes nothing any more.
+# Of adjusting and finding points anew: on the images of benchmarks/own_pictures.py a third changes nothing any more.
 _ROUNDS = 2
 
 STAGES = ("features", "matches", "cameras")
 """Lines that the program prints while it works, before ``registered N``."""
 
 
-def reconstruct(pictures: Path, out: Path) -> int:
-    """Write the largest model that pycolmap finds to ``out/model`` and return how many pictures are in it.
+def reconstruct(images: Path, out: Path) -> int:
+    """Write the largest model that pycolmap finds to ``out/model`` and return how many images are in it.
 
-    All pictures share one camera, since they have one size; its lens is found along with the poses.
+    All images share one camera, since they have one size; its lens is found along with the poses.
     """
     import pycolmap
 
     pycolmap.set_random_seed(0)
     database = out / "database.db"
     print(STAGES[0], flush=True)
-    pycolmap.extract_features(database, pictures, camera_mode=pycolmap.CameraMode.SINGLE)
+    pycolmap.extract_features(database, images, camera_mode=pycolmap.CameraMode.SINGLE)
     print(STAGES[1], flush=True)
     pycolmap.match_exhaustive(database)
     print(STAGES[2], flush=True)
     # A lens that is adjusted from the first pair on can collapse to a wide angle when cameras stand in a circle. So it
-    # stays as EXIF data say (or as most lenses are) until all pictures have their places.
-    best = _largest_model(database, pictures, out / "kept_lens", adjust_lens=False)
+    # stays as EXIF data say (or as most lenses are) until all images have their places.
+    best = _largest_model(database, images, out / "kept_lens", adjust_lens=False)
     if best is not None:
-        best = _refined(best, database, pictures, out)
-    count = sum(1 for path in pictures.iterdir() if path.is_file())
+        best = _refined(best, database, images, out)
+    count = sum(1 for path in images.iterdir() if path.is_file())
     if best is None or best.num_reg_images() < _ENOUGH * count:
-        free = _largest_model(database, pictures, out / "free_lens", adjust_lens=True)
+        free = _largest_model(database, images, out / "free_lens", adjust_lens=True)
         if free is not None and (best is None or free.num_reg_images() > best.num_reg_images()):
             best = free
     if best is None:
@@ -51,7 +51,7 @@ def reconstruct(pictures: Path, out: Path) -> int:
     return int(best.num_reg_images())
 
 
-def _refined(model: Any, database: Path, pictures: Path, out: Path) -> Any:
+def _refined(model: Any, database: Path, images: Path, out: Path) -> Any:
     """Adjust poses and lens together, then find the points anew: what was an outlier before may fit now."""
     import pycolmap
 
@@ -60,14 +60,14 @@ def _refined(model: Any, database: Path, pictures: Path, out: Path) -> Any:
         folder = out / f"refined_{turn}"
         folder.mkdir()
         model = pycolmap.triangulate_points(
-            model, database, pictures, folder, clear_points=True, refine_intrinsics=True
+            model, database, images, folder, clear_points=True, refine_intrinsics=True
         )
         pycolmap.bundle_adjustment(model, pycolmap.BundleAdjustmentOptions())
     return model
 
 
-def _largest_model(database: Path, pictures: Path, out: Path, *, adjust_lens: bool) -> Any:
-    """The ``pycolmap.Reconstruction`` with the most pictures, or None."""
+def _largest_model(database: Path, images: Path, out: Path, *, adjust_lens: bool) -> Any:
+    """The ``pycolmap.Reconstruction`` with the most images, or None."""
     import pycolmap
 
     out.mkdir()
@@ -76,7 +76,7 @@ def _largest_model(database: Path, pictures: Path, out: Path, *, adjust_lens: bo
     options.mapper.random_seed = 0
     options.ba_refine_focal_length = adjust_lens
     options.ba_refine_extra_params = adjust_lens
-    models = pycolmap.incremental_mapping(database, pictures, out, options)
+    models = pycolmap.incremental_mapping(database, images, out, options)
     return max(models.values(), key=lambda model: model.num_reg_images(), default=None)
 
 

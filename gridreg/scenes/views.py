@@ -1,4 +1,4 @@
-"""What a scene is once it has been read: posed images, the box they look at, and where they came from."""
+"""A scene that has been read: posed images, the box they look at, and where they came from."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gridreg.errors import InputError
 
 __all__ = ["Scene", "Views", "background_colour"]
 
-# Share of a picture's edge that is looked at for a backdrop, and of its pixels that must have the colour up to a bound.
+# Fraction of the edge that is looked at for a backdrop, and of its pixels that must have the colour up to a bound.
 _FRAME, _AGREEING, _CLOSE = 0.02, 0.9, 0.05
 
 _COLOURS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
@@ -89,9 +89,9 @@ class Views:
 
     @functools.cached_property
     def backdrop(self) -> Tensor | None:
-        """The one colour that opaque pictures have along their edges (a sheet of paper, a studio), ``(3,)``.
+        """The one colour that opaque images have along their edges (a sheet of paper, a studio), ``(3,)``.
 
-        None where pictures are transparent, so that nobody needs to guess, and where they show a room.
+        None where images are transparent, so that nobody needs to guess, and where they show a room.
 
         Example:
             >>> rgba = torch.ones(1, 50, 50, 4)
@@ -142,7 +142,7 @@ class Scene:
         near: distance along a ray, world units, before which nothing is looked for.
         far: distance along a ray, world units, beyond which nothing is looked for.
         bounds: ``(2, 3)`` float32, lower and upper corner of the box that holds the scene, world units.
-        background: ``(3,)`` float32, the colour behind renders and targets; that of opaque pictures' `Views.backdrop`.
+        background: ``(3,)`` float32, the colour behind renders and targets; that of opaque images' `Views.backdrop`.
         fingerprint: hash of what training sees: the training images' pixels, ids, size and cameras. It does
             not depend on which test or validation views were read, so a checkpoint can be scored on others.
         builtin: whether this is the built-in scene, which no published figure is about.

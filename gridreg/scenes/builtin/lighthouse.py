@@ -24,7 +24,7 @@ from gridreg.scenes.builtin.materials import (
     spiral,
     strata,
 )
-from gridreg.scenes.builtin.solids import Ball, Block, Frustum, Solid, turned
+from gridreg.scenes.builtin.solids import Ball, Cuboid, Frustum, Solid, rotate
 
 __all__ = ["BOUNDS", "Part", "lighthouse"]
 
@@ -59,11 +59,11 @@ class Part:
 
     def local(self, points: Array) -> Array:
         """Return ``(N, 3)`` world points in the part's frame."""
-        return turned(points - self.origin, self.axes)
+        return rotate(points - self.origin, self.axes)
 
     def world(self, points: Array) -> Array:
         """Return ``(N, 3)`` points of the part's frame in the world."""
-        return turned(points, self.axes.T) + self.origin
+        return rotate(points, self.axes.T) + self.origin
 
 
 @cache
@@ -74,10 +74,10 @@ def lighthouse() -> tuple[Part, ...]:
 
 def _at(solid: Solid, place: Sequence[float] | Array, material: Material, *, turn: float = 0.0) -> Part:
     """Place a solid upright, turned about z by ``turn`` radians."""
-    return Part(solid, np.array(place, dtype=np.float64), _turned(turn), material)
+    return Part(solid, np.array(place, dtype=np.float64), _about_z(turn), material)
 
 
-def _turned(angle: float) -> Array:
+def _about_z(angle: float) -> Array:
     """Return the rotation about z by ``angle`` radians."""
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
@@ -122,11 +122,11 @@ def _island() -> Iterator[Part]:
 def _tower() -> Iterator[Part]:
     x, y = -0.22, 0.14
     yield _at(Frustum(0.31, 0.18, 0.98), (x, y, -0.52), Material(spiral(_WHITE, _RED, pitch=0.52)))
-    yield _at(Block((0.07, 0.03, 0.12)), (x, y - 0.285, -0.40), Material(checker(_WOOD, _DARK, 0.035)))
+    yield _at(Cuboid((0.07, 0.03, 0.12)), (x, y - 0.285, -0.40), Material(checker(_WOOD, _DARK, 0.035)))
     for level, turn in ((-0.02, 0.3), (0.18, 2.2), (0.02, 4.1)):
         radius = 0.31 - 0.13 * (level + 0.52) / 0.98
         window = _ring(1, radius - 0.01, x, y, level, turn)[0]
-        yield _at(Block((0.03, 0.035, 0.05)), window, Material(plain(_DARK), gloss=0.5), turn=turn)
+        yield _at(Cuboid((0.03, 0.035, 0.05)), window, Material(plain(_DARK), gloss=0.5), turn=turn)
     yield _at(Frustum(0.20, 0.34, 0.06), (x, y, 0.42), Material(plain(_WHITE)))
     feet, heads = _ring(12, 0.32, x, y, 0.47), _ring(12, 0.32, x, y, 0.62)
     middles = (feet + heads) / 2
@@ -152,17 +152,17 @@ def _house() -> Iterator[Part]:
     x, y, turn = 0.45, -0.18, 0.5
     wall = Material(bricks((0.70, 0.42, 0.30), (0.86, 0.82, 0.76), length=0.085, height=0.042))
     tiles = Material(checker((0.22, 0.30, 0.46), (0.34, 0.44, 0.60), 0.045))
-    yield _at(Block((0.24, 0.17, 0.14)), (x, y, -0.37), wall, turn=turn)
+    yield _at(Cuboid((0.24, 0.17, 0.14)), (x, y, -0.37), wall, turn=turn)
     # A box on its edge, sunk into the walls, is the gabled roof.
-    upright = _turned(turn)
+    upright = _about_z(turn)
     h = np.sqrt(0.5)
     tilted = np.array([[1.0, 0.0, 0.0], [0.0, h, -h], [0.0, h, h]])
-    yield Part(Block((0.27, 0.135, 0.135)), np.array([x, y, -0.235]), upright @ tilted, tiles)
-    yield _at(Block((0.035, 0.035, 0.10)), np.array([x, y, -0.05]) + 0.14 * upright[:, 0], wall, turn=turn)
+    yield Part(Cuboid((0.27, 0.135, 0.135)), np.array([x, y, -0.235]), upright @ tilted, tiles)
+    yield _at(Cuboid((0.035, 0.035, 0.10)), np.array([x, y, -0.05]) + 0.14 * upright[:, 0], wall, turn=turn)
     door = np.array([x, y, -0.42]) + upright @ np.array([0.05, -0.165, 0.0])
-    yield _at(Block((0.045, 0.02, 0.09)), door, Material(plain((0.20, 0.45, 0.42))), turn=turn)
+    yield _at(Cuboid((0.045, 0.02, 0.09)), door, Material(plain((0.20, 0.45, 0.42))), turn=turn)
     pane = np.array([x, y, -0.36]) + upright @ np.array([-0.11, -0.165, 0.0])
-    yield _at(Block((0.04, 0.015, 0.04)), pane, Material(plain(_DARK), gloss=0.6), turn=turn)
+    yield _at(Cuboid((0.04, 0.015, 0.04)), pane, Material(plain(_DARK), gloss=0.6), turn=turn)
 
 
 def _fence() -> Iterator[Part]:
@@ -177,7 +177,7 @@ def _fence() -> Iterator[Part]:
 
 def _small_things() -> Iterator[Part]:
     # A bench: a seat that hides what is under it.
-    yield _at(Block((0.15, 0.055, 0.012)), (-0.05, -0.58, -0.41), _TIMBER, turn=0.15)
+    yield _at(Cuboid((0.15, 0.055, 0.012)), (-0.05, -0.58, -0.41), _TIMBER, turn=0.15)
     for dx, dy in ((-0.12, -0.035), (-0.12, 0.035), (0.12, -0.035), (0.12, 0.035)):
         yield _at(Frustum(0.010, 0.010, 0.10), (-0.05 + dx, -0.58 + dy + 0.15 * dx, -0.51), _IRON)
     # A glossy buoy with a band.
@@ -188,7 +188,7 @@ def _small_things() -> Iterator[Part]:
     yield _rod(pole, _up(pole, 0.75), 0.010, _TIMBER)
     yield _at(Ball(0.02), _up(pole, 0.76), Material(plain((0.85, 0.66, 0.25)), gloss=0.8))
     flag = Material(checker((0.12, 0.28, 0.62), (0.95, 0.85, 0.30), 0.06))
-    yield _at(Block((0.13, 0.006, 0.08)), pole + np.array([-0.09, 0.10, 0.65]), flag, turn=2.3)
+    yield _at(Cuboid((0.13, 0.006, 0.08)), pole + np.array([-0.09, 0.10, 0.65]), flag, turn=2.3)
     # A fir: cones stacked on a trunk.
     leaf = Material(speckle((0.10, 0.30, 0.18), (0.20, 0.46, 0.24), grain=0.04))
     yield _at(Frustum(0.03, 0.03, 0.15), (0.02, 0.72, -0.52), _TIMBER)

@@ -20,7 +20,7 @@ _FILL = np.array([-0.7, 0.5, 0.2])
 
 @dataclass(frozen=True)
 class Material:
-    """What a part looks like.
+    """Appearance of a part.
 
     Attributes:
         texture: colour in [0, 1] at ``(N, 3)`` points in the part's frame.
@@ -117,8 +117,8 @@ def strata(a: Colour, b: Colour, *, thickness: float) -> Texture:
 
     def texture(points: Array) -> Array:
         wave = 0.35 * np.sin(7 * points[:, 0]) + 0.35 * np.sin(9 * points[:, 1] + 1)
-        share = 0.5 + 0.5 * np.sin(2 * np.pi * (points[:, 2] / thickness + wave))
-        return np.asarray(np.array(a) + share[:, None] * (np.array(b) - np.array(a)))
+        fraction = 0.5 + 0.5 * np.sin(2 * np.pi * (points[:, 2] / thickness + wave))
+        return np.asarray(np.array(a) + fraction[:, None] * (np.array(b) - np.array(a)))
 
     return texture
 
@@ -127,8 +127,8 @@ def speckle(a: Colour, b: Colour, *, grain: float) -> Texture:
     """Cells of ``grain`` world units, each with a random mix of two colours."""
 
     def texture(points: Array) -> Array:
-        share = _hash(*np.floor(points / grain + 0.3137).T)
-        return np.asarray(np.array(a) + share[:, None] * (np.array(b) - np.array(a)))
+        fraction = _hash(*np.floor(points / grain + 0.3137).T)
+        return np.asarray(np.array(a) + fraction[:, None] * (np.array(b) - np.array(a)))
 
     return texture
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from gridreg.scenes.builtin.lighthouse import Part, lighthouse
 from gridreg.scenes.builtin.materials import shade
-from gridreg.scenes.builtin.solids import turned
+from gridreg.scenes.builtin.solids import rotate
 
 __all__ = ["Hits", "cast", "render_rgba"]
 
@@ -98,7 +98,7 @@ def render_rgba(pose: Array, intrinsics: Array, width: int, height: int, *, samp
     found = found[np.argsort(hits.part.ravel()[found], kind="stable")]
     row, column = np.divmod(found, width * samples)
     slopes = np.stack([hits.right[column], -hits.down[row], -np.ones(len(found))], axis=-1)
-    rays = turned(slopes, pose[:3, :3].T)
+    rays = rotate(slopes, pose[:3, :3].T)
     points = pose[:3, 3] + hits.parameter.ravel()[found, None] * rays
     to_camera = -rays / np.linalg.norm(rays, axis=-1, keepdims=True)
     colour = np.empty((len(found), 3))
@@ -107,7 +107,7 @@ def render_rgba(pose: Array, intrinsics: Array, width: int, height: int, *, samp
     for number, part in enumerate(parts):
         of_part = slice(starts[number], starts[number + 1])
         local = part.local(points[of_part])
-        normals = turned(part.solid.normal(local), part.axes.T)
+        normals = rotate(part.solid.normal(local), part.axes.T)
         colour[of_part] = shade(part.material, local, normals, to_camera[of_part])
     pixel = (row // samples) * width + column // samples
     covered = np.bincount(pixel, minlength=width * height)

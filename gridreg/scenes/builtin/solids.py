@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Ball", "Block", "Frustum", "Solid", "turned"]
+__all__ = ["Ball", "Cuboid", "Frustum", "Solid", "rotate"]
 
 Array = NDArray[np.float64]
 
@@ -20,7 +20,7 @@ _TINY = 1e-12
 _ON_SURFACE = 1e-9
 
 
-def turned(vectors: Array, matrix: Array) -> Array:
+def rotate(vectors: Array, matrix: Array) -> Array:
     """Return ``vectors @ matrix`` for ``(N, 3)`` and ``(3, 3)``.
 
     Written out because waking the threads of a BLAS for three columns costs more than the product.
@@ -93,7 +93,7 @@ class Ball:
 
 
 @dataclass(frozen=True)
-class Block:
+class Cuboid:
     """A box of half extents ``half`` around the origin."""
 
     half: tuple[float, float, float]
@@ -226,8 +226,8 @@ class Frustum:
         cap_x = radius - np.minimum(radius, np.where(level < half, self.low, self.high))
         cap_y = np.abs(level - half) - half
         along = np.array([self.high - self.low, self.height])
-        share = np.clip(((radius - self.low) * along[0] + level * along[1]) / (along @ along), 0, 1)
-        side_x, side_y = radius - self.low - along[0] * share, level - along[1] * share
+        fraction = np.clip(((radius - self.low) * along[0] + level * along[1]) / (along @ along), 0, 1)
+        side_x, side_y = radius - self.low - along[0] * fraction, level - along[1] * fraction
         inside = (side_x < 0) & (cap_y < 0)
         squared = np.minimum(cap_x**2 + cap_y**2, side_x**2 + side_y**2)
         return np.asarray(np.where(inside, -1, 1) * np.sqrt(squared))
@@ -257,10 +257,10 @@ class Frustum:
         on_side = np.sqrt(self.low**2 + u * (self.high**2 - self.low**2))
         radius = np.choose(part, [self.low * np.sqrt(u), self.high * np.sqrt(u), on_side])
         grown = self.high - self.low
-        share = (on_side - self.low) / grown if grown else u
-        level = np.choose(part, [np.zeros(count), np.full(count, self.height), share * self.height])
+        fraction = (on_side - self.low) / grown if grown else u
+        level = np.choose(part, [np.zeros(count), np.full(count, self.height), fraction * self.height])
         return np.stack([radius * np.cos(angle), radius * np.sin(angle), level], axis=-1)
 
 
-Solid = Ball | Block | Frustum
+Solid = Ball | Cuboid | Frustum
 """A convex body, on or around the origin of its frame."""

@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 
 from gridreg.scenes.builtin.lighthouse import lighthouse
-from gridreg.scenes.builtin.solids import turned
+from gridreg.scenes.builtin.solids import rotate
 from gridreg.scenes.builtin.tessellate import tessellate
 
 __all__ = ["builtin_mesh", "builtin_signed_distance", "builtin_surface"]
@@ -54,12 +54,12 @@ def builtin_surface(count: int, generator: torch.Generator) -> tuple[Array, Arra
     areas = np.array([part.solid.area for part in parts])
     points, normals = np.empty((0, 3)), np.empty((0, 3))
     while len(points) < count:
-        shares = rng.multinomial(2 * (count - len(points)) + 64, areas / areas.sum())
+        counts = rng.multinomial(2 * (count - len(points)) + 64, areas / areas.sum())
         batch, batch_normals = [], []
-        for part, share in zip(parts, shares, strict=True):
-            local = part.solid.sample(int(share), rng)
+        for part, number in zip(parts, counts, strict=True):
+            local = part.solid.sample(int(number), rng)
             batch.append(part.world(local))
-            batch_normals.append(turned(part.solid.normal(local), part.axes.T))
+            batch_normals.append(rotate(part.solid.normal(local), part.axes.T))
         drawn, drawn_normals = np.concatenate(batch), np.concatenate(batch_normals)
         # Shuffled, so that cutting the list to `count` favours no part.
         order = rng.permutation(len(drawn))

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from gridreg.scenes.builtin.solids import Ball, Block, Frustum, Solid
+from gridreg.scenes.builtin.solids import Ball, Cuboid, Frustum, Solid
 
 __all__ = ["tessellate"]
 
@@ -27,8 +27,8 @@ def tessellate(solid: Solid, edge: float) -> Mesh:
     Raises:
         TypeError: for a solid of another class.
     """
-    if isinstance(solid, Block):
-        return _joined([_block_face(solid, axis, side, edge) for axis in range(3) for side in (-1, 1)])
+    if isinstance(solid, Cuboid):
+        return _joined([_cuboid_face(solid, axis, side, edge) for axis in range(3) for side in (-1, 1)])
     if isinstance(solid, Ball):
         polar = np.linspace(0, math.pi, _steps(math.pi * solid.radius, edge))
         return _lathe(solid.radius * np.sin(polar), -solid.radius * np.cos(polar), edge)
@@ -65,8 +65,8 @@ def _lathe(radii: Array, levels: Array, edge: float) -> Mesh:
     return vertices.reshape(-1, 3), _grid_faces(len(radii), around + 1)[:, ::-1]
 
 
-def _block_face(block: Block, axis: int, side: int, edge: float) -> Mesh:
-    half = np.array(block.half)
+def _cuboid_face(cuboid: Cuboid, axis: int, side: int, edge: float) -> Mesh:
+    half = np.array(cuboid.half)
     u, v = (axis + 1) % 3, (axis + 2) % 3
     along_u = np.linspace(-half[u], half[u], _steps(2 * half[u], edge))
     along_v = np.linspace(-half[v], half[v], _steps(2 * half[v], edge))

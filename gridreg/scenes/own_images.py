@@ -1,4 +1,4 @@
-"""Own pictures: gathering them in a scene folder, and cameras for them by structure from motion."""
+"""Own images: gathering them in a scene folder, and cameras for them by structure from motion."""
 
 from __future__ import annotations
 
@@ -20,55 +20,53 @@ from gridreg.scenes.colmap_model import read_model
 from gridreg.scenes.frames import Frame, SceneFiles, resolve_inside
 from gridreg.scenes.images import copy_upright, read_rgba
 
-__all__ = ["attach_masks", "copy_frames", "copy_pictures", "find_cameras", "shrink_pictures"]
+__all__ = ["attach_masks", "copy_frames", "copy_images", "find_cameras", "shrink_images"]
 
 Progress = Callable[[str], None]
 
-_PICTURES = (".png", ".jpg", ".jpeg")
+_IMAGES = (".png", ".jpg", ".jpeg")
 _FEWEST = 4
 _ADVICE = (
-    "take more pictures, each sharing two thirds of its view with its neighbours, sharp, without zooming, "
+    "take more images, each sharing two thirds of its view with its neighbours, sharp, without zooming, "
     "of things with texture (a newspaper under the object helps)"
 )
 
 
-def copy_pictures(source: Path, scene: Path) -> list[str]:
-    """Copy the pictures of a folder upright into ``scene/images`` and return their names.
+def copy_images(source: Path, scene: Path) -> list[str]:
+    """Copy the images of a folder upright into ``scene/images`` and return their names.
 
     Raises:
-        InputError: for a folder without pictures, a damaged one, or pictures of different sizes.
+        InputError: for a folder without images, a damaged one, or images of different sizes.
     """
-    pictures = sorted(
-        path for path in source.iterdir() if path.suffix.lower() in _PICTURES and path.is_file()
-    )
-    if not pictures:
+    images = sorted(path for path in source.iterdir() if path.suffix.lower() in _IMAGES and path.is_file())
+    if not images:
         others = sorted({path.suffix for path in source.iterdir() if path.is_file() and path.suffix})
         found = f"only {', '.join(others)} files" if others else "nothing"
-        raise InputError(f"{source}: found {found}, expected pictures (.jpg or .png)")
-    if len(pictures) < _FEWEST:
-        raise InputError(f"{source}: found {len(pictures)} pictures, expected at least {_FEWEST}; {_ADVICE}")
+        raise InputError(f"{source}: found {found}, expected images (.jpg or .png)")
+    if len(images) < _FEWEST:
+        raise InputError(f"{source}: found {len(images)} images, expected at least {_FEWEST}; {_ADVICE}")
     first: tuple[int, int] | None = None
-    for path in pictures:
+    for path in images:
         size = copy_upright(path, scene / "images" / path.name)
         first = first or size
         if size != first:
             raise InputError(
-                f"{path}: picture is {size[0]}x{size[1]} upright, expected {first[0]}x{first[1]} as "
-                f"{pictures[0].name}: all pictures share one camera"
+                f"{path}: image is {size[0]}x{size[1]} upright, expected {first[0]}x{first[1]} as "
+                f"{images[0].name}: all images share one camera"
             )
-    return [path.name for path in pictures]
+    return [path.name for path in images]
 
 
 def find_cameras(
     scene: Path, names: list[str], scratch: Path, progress: Progress
 ) -> tuple[list[Frame], NDArray[np.float64] | None]:
-    """Find the cameras of the pictures in ``scene/images`` by pycolmap.
+    """Find the cameras of the images in ``scene/images`` by pycolmap.
 
     Returns:
-        Frames of the registered pictures, and ``(P, 3)`` points on surfaces, in the world of the model.
+        Frames of the registered images, and ``(P, 3)`` points on surfaces, in the world of the model.
 
     Raises:
-        InputError: when pycolmap is missing or fails, or fewer than half of the pictures (or 4) got a camera.
+        InputError: when pycolmap is missing or fails, or fewer than half of the images (or 4) got a camera.
     """
     if importlib.util.find_spec("pycolmap") is None:
         raise InputError(
@@ -93,14 +91,14 @@ def find_cameras(
         last = (log.read_text(errors="replace").strip().splitlines() or ["no message"])[-1]
         raise InputError(f"pycolmap failed with status {worker.returncode}: {last}")
     if registered < max(_FEWEST, len(names) / 2):
-        raise InputError(f"only {registered} of {len(names)} pictures could be registered; {_ADVICE}")
+        raise InputError(f"only {registered} of {len(names)} images could be registered; {_ADVICE}")
     model = read_model(scratch / "model")
     frames = frames_of_model(model, scene, "images", "pycolmap")
     return frames, model.points if len(model.points) else None
 
 
 def _write_opaque(path: Path, target: Path) -> None:
-    """Give features nothing to hold on to where a picture is transparent: a flat grey."""
+    """Give features nothing to hold on to where an image is transparent: a flat grey."""
     rgba = read_rgba(path, opaque=True)
     if (rgba[..., 3] == 1).all():
         target.write_bytes(path.read_bytes())
@@ -110,12 +108,12 @@ def _write_opaque(path: Path, target: Path) -> None:
 
 
 def copy_frames(files: SceneFiles, scene: Path) -> list[Frame]:
-    """Copy the pictures and masks of a scene with cameras into another folder and return frames that name
+    """Copy the images and masks of a scene with cameras into another folder and return frames that name
     them there.
 
     Raises:
-        InputError: for a picture or mask that is missing or damaged, outside of its scene, or of another size than its
-            camera or the other pictures.
+        InputError: for an image or mask that is missing or damaged, outside of its scene, or of another size than its
+            camera or the other images.
     """
     frames = sorted([*files.train, *files.test], key=lambda frame: frame.file_path)
     paths = [resolve_inside(files.folder, frame.file_path, frame.where) for frame in frames]
@@ -132,7 +130,7 @@ def copy_frames(files: SceneFiles, scene: Path) -> list[Frame]:
         expected = (frame.camera.width or first[0], frame.camera.height or first[1])
         for wanted in (expected, first):
             if size != wanted:
-                raise InputError(f"{path}: picture is {size[0]}x{size[1]}, expected {wanted[0]}x{wanted[1]}")
+                raise InputError(f"{path}: image is {size[0]}x{size[1]}, expected {wanted[0]}x{wanted[1]}")
         mask_path = None
         if frame.mask_path is not None:
             mask = resolve_inside(files.folder, frame.mask_path, frame.where)
@@ -156,31 +154,31 @@ def attach_masks(frames: list[Frame], masks: Path, scene: Path) -> list[Frame]:
 
 
 def _copy_mask(mask: Path, scene: Path, name: str) -> str:
-    """Copy the mask of the picture ``name`` into ``scene/masks`` and return its path there."""
+    """Copy the mask of the image ``name`` into ``scene/masks`` and return its path there."""
     (scene / "masks").mkdir(exist_ok=True)
     place = f"masks/{name}{mask.suffix}"
     copy_upright(mask, scene / place)
     return place
 
 
-def shrink_pictures(frames: list[Frame], scene: Path, size: tuple[int, int], longest: int) -> tuple[int, int]:
-    """Reduce pictures and masks of ``size`` in place, so that their longer edge is at most ``longest`` pixels.
+def shrink_images(frames: list[Frame], scene: Path, size: tuple[int, int], longest: int) -> tuple[int, int]:
+    """Reduce images and masks of ``size`` in place, so that their longer edge is at most ``longest`` pixels.
 
     Returns:
-        Width and height of the pictures now.
+        Width and height of the images now.
     """
-    share = longest / max(size)
-    if share >= 1:
+    fraction = longest / max(size)
+    if fraction >= 1:
         return size
-    new = max(1, round(size[0] * share)), max(1, round(size[1] * share))
+    new = max(1, round(size[0] * fraction)), max(1, round(size[1] * fraction))
     for frame in frames:
         for name in (frame.file_path, frame.mask_path):
             if name is None:
                 continue
             path = scene / name
             with Image.open(path) as opened:
-                picture = opened
+                image = opened
                 if opened.mode in ("1", "P"):
-                    picture = opened.convert("RGBA" if opened.has_transparency_data else "RGB")
-                picture.resize(new, Image.Resampling.BOX).save(path, quality=95)
+                    image = opened.convert("RGBA" if opened.has_transparency_data else "RGB")
+                image.resize(new, Image.Resampling.BOX).save(path, quality=95)
     return new

@@ -1,4 +1,4 @@
-"""`prepare` on pictures without cameras, with a stand-in for pycolmap."""
+"""`prepare` on images without cameras, with a stand-in for pycolmap."""
 
 from __future__ import annotations
 
@@ -34,16 +34,16 @@ def refused(source: Path, out: Path, pattern: str, **options: Any) -> None:
 
 
 @pytest.fixture
-def pictures(source: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(source / "train", tmp_path / "pictures"))
+def images(source: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(source / "train", tmp_path / "images"))
 
 
-class TestPictures:
-    """Pictures without cameras, with a stand-in for pycolmap that knows them."""
+class TestImages:
+    """Images without cameras, with a stand-in for pycolmap that knows them."""
 
     @pytest.fixture
     def stand_in(self, source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-        """A worker that registers the pictures named in ``names.txt``, from a text model of the true cameras."""
+        """A worker that registers the images named in ``names.txt``, from a text model of the true cameras."""
         views = load_scene(source, "first18", test=[]).train
         lines = []
         for name, pose in zip(views.names, views.poses.numpy(), strict=True):
@@ -56,10 +56,10 @@ class TestPictures:
         script = tmp_path / "stand_in.py"
         script.write_text(
             "import sys, pathlib\n"
-            "pictures, out = map(pathlib.Path, sys.argv[1:])\n"
+            "images, out = map(pathlib.Path, sys.argv[1:])\n"
             f"known = dict({lines!r})\n"
             f"asked = pathlib.Path({str(tmp_path / 'names.txt')!r})\n"
-            "names = asked.read_text().split() if asked.exists() else sorted(p.name for p in pictures.iterdir())\n"
+            "names = asked.read_text().split() if asked.exists() else sorted(p.name for p in images.iterdir())\n"
             "(out / 'model').mkdir()\n"
             f"(out / 'model/cameras.txt').write_text('1 SIMPLE_PINHOLE 16 16 {focal} 8 8')\n"
             "text = '\\n'.join(f'{k} {known[n]} 1 {n}\\n' for k, n in enumerate(names))\n"
@@ -71,9 +71,9 @@ class TestPictures:
         monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
         return script
 
-    def test_become_a_scene(self, pictures: Path, stand_in: Path, tmp_path: Path, source: Path) -> None:
+    def test_become_a_scene(self, images: Path, stand_in: Path, tmp_path: Path, source: Path) -> None:
         stages: list[str] = []
-        prepared = prepare(pictures, tmp_path / "out", progress=stages.append)
+        prepared = prepare(images, tmp_path / "out", progress=stages.append)
         assert stages == ["features", "matches", "cameras", "box"]
         assert len(prepared.registered) == 18
         loaded = load_scene(tmp_path / "out", "holdout8")
@@ -84,73 +84,73 @@ class TestPictures:
         wanted = torch.linalg.inv(original.poses[rows[0]]) @ original.poses[rows[5]]
         torch.testing.assert_close(relative[:3, :3], wanted[:3, :3], atol=1e-4, rtol=0)
 
-    def test_some_are_left_out_and_named(self, pictures: Path, stand_in: Path, tmp_path: Path) -> None:
+    def test_some_are_left_out_and_named(self, images: Path, stand_in: Path, tmp_path: Path) -> None:
         (tmp_path / "names.txt").write_text(" ".join(f"r_{k}.png" for k in range(10)))
-        prepared = prepare(pictures, tmp_path / "out")
+        prepared = prepare(images, tmp_path / "out")
         assert len(prepared.registered) == 10
         assert prepared.missing == tuple(sorted(f"r_{k}.png" for k in range(10, 18)))
-        assert "10 of 18 pictures have cameras (not r_10.png," in str(prepared)
+        assert "10 of 18 images have cameras (not r_10.png," in str(prepared)
 
-    def test_too_few_registered(self, pictures: Path, stand_in: Path, tmp_path: Path) -> None:
+    def test_too_few_registered(self, images: Path, stand_in: Path, tmp_path: Path) -> None:
         (tmp_path / "names.txt").write_text(" ".join(f"r_{k}.png" for k in range(8)))
-        refused(pictures, tmp_path / "out", r"only 8 of 18 pictures could be registered; take more pictures")
+        refused(images, tmp_path / "out", r"only 8 of 18 images could be registered; take more images")
 
-    def test_the_worker_fails(self, pictures: Path, stand_in: Path, tmp_path: Path) -> None:
+    def test_the_worker_fails(self, images: Path, stand_in: Path, tmp_path: Path) -> None:
         stand_in.write_text("import sys; sys.stderr.write('a\\nno memory\\n'); sys.exit(3)")
-        refused(pictures, tmp_path / "out", r"pycolmap failed with status 3: no memory")
+        refused(images, tmp_path / "out", r"pycolmap failed with status 3: no memory")
         stand_in.write_text("import os; os.abort()")
-        refused(pictures, tmp_path / "out", r"pycolmap failed with status -6: no message")
+        refused(images, tmp_path / "out", r"pycolmap failed with status -6: no message")
 
-    def test_transparent_pictures_are_matched_on_grey(
-        self, pictures: Path, stand_in: Path, tmp_path: Path
+    def test_transparent_images_are_matched_on_grey(
+        self, images: Path, stand_in: Path, tmp_path: Path
     ) -> None:
         seen = tmp_path / "seen"
         code = f"import shutil\nshutil.copytree(sys.argv[1], {str(seen)!r})\n"
-        stand_in.write_text(stand_in.read_text().replace("pictures, out =", code + "pictures, out ="))
-        prepare(pictures, tmp_path / "out")
+        stand_in.write_text(stand_in.read_text().replace("images, out =", code + "images, out ="))
+        prepare(images, tmp_path / "out")
         image = np.asarray(Image.open(seen / "r_0.png"))
         assert image.shape == (SIZE, SIZE, 3)
         assert image[0, 0].tolist() == [128, 128, 128]
 
-    def test_turned_pictures_are_copied_upright(self, pictures: Path, stand_in: Path, tmp_path: Path) -> None:
-        path = pictures / "r_4.png"
+    def test_turned_images_are_copied_upright(self, images: Path, stand_in: Path, tmp_path: Path) -> None:
+        path = images / "r_4.png"
         upright = np.asarray(Image.open(path))
         exif = Image.Exif()
         exif[274] = 8
         Image.fromarray(np.ascontiguousarray(np.rot90(upright, -1))).save(path, exif=exif)
-        prepare(pictures, tmp_path / "out")
+        prepare(images, tmp_path / "out")
         copied = Image.open(tmp_path / "out/images/r_4.png")
         assert copied.getexif().get(274) is None
         np.testing.assert_array_equal(np.asarray(copied), upright)
-        assert (tmp_path / "out/images/r_5.png").read_bytes() == (pictures / "r_5.png").read_bytes()
+        assert (tmp_path / "out/images/r_5.png").read_bytes() == (images / "r_5.png").read_bytes()
 
     def test_none(self, tmp_path: Path) -> None:
         (tmp_path / "empty").mkdir()
-        refused(tmp_path / "empty", tmp_path / "out", r"empty: found nothing, expected pictures")
+        refused(tmp_path / "empty", tmp_path / "out", r"empty: found nothing, expected images")
         (tmp_path / "empty/a.HEIC").write_text("")
         (tmp_path / "empty/notes.txt").write_text("")
         refused(
-            tmp_path / "empty", tmp_path / "out", r"found only \.HEIC, \.txt files, expected pictures \(\.jpg"
+            tmp_path / "empty", tmp_path / "out", r"found only \.HEIC, \.txt files, expected images \(\.jpg"
         )
 
-    def test_three(self, pictures: Path, tmp_path: Path) -> None:
+    def test_three(self, images: Path, tmp_path: Path) -> None:
         for k in range(3, 18):
-            (pictures / f"r_{k}.png").unlink()
-        refused(pictures, tmp_path / "out", "found 3 pictures, expected at least 4; take more pictures")
+            (images / f"r_{k}.png").unlink()
+        refused(images, tmp_path / "out", "found 3 images, expected at least 4; take more images")
 
-    def test_of_different_sizes(self, pictures: Path, tmp_path: Path) -> None:
-        Image.new("RGB", (12, 16)).save(pictures / "r_7.png")
-        refused(pictures, tmp_path / "out", r"r_7\.png: picture is 12x16 upright, expected 16x16 as r_0\.png")
+    def test_of_different_sizes(self, images: Path, tmp_path: Path) -> None:
+        Image.new("RGB", (12, 16)).save(images / "r_7.png")
+        refused(images, tmp_path / "out", r"r_7\.png: image is 12x16 upright, expected 16x16 as r_0\.png")
 
-    def test_damaged(self, pictures: Path, tmp_path: Path) -> None:
-        path = pictures / "r_7.png"
+    def test_damaged(self, images: Path, tmp_path: Path) -> None:
+        path = images / "r_7.png"
         path.write_bytes(path.read_bytes()[:-40])
-        refused(pictures, tmp_path / "out", r"r_7\.png: not a whole image")
+        refused(images, tmp_path / "out", r"r_7\.png: not a whole image")
 
-    def test_unreadable_exif(self, pictures: Path, tmp_path: Path) -> None:
-        Image.new("RGB", (SIZE, SIZE)).save(pictures / "a.jpg", exif=b"Exif\0\0garbage that is no TIFF")
-        refused(pictures, tmp_path / "out", r"a\.jpg: EXIF data cannot be read")
+    def test_unreadable_exif(self, images: Path, tmp_path: Path) -> None:
+        Image.new("RGB", (SIZE, SIZE)).save(images / "a.jpg", exif=b"Exif\0\0garbage that is no TIFF")
+        refused(images, tmp_path / "out", r"a\.jpg: EXIF data cannot be read")
 
-    def test_without_pycolmap(self, pictures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_without_pycolmap(self, images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-        refused(pictures, tmp_path / "out", r"pycolmap is not installed: pip install 'gridreg\[colmap\]'")
+        refused(images, tmp_path / "out", r"pycolmap is not installed: pip install 'gridreg\[colmap\]'")
