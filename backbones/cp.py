@@ -62,7 +62,7 @@ class CPField(TensorialField):
         return ops.cp_features(u, list(self.appearance_lines), _open_components(self.appearance_lines))
 
     def _marched(
-        self, march: ops.March, activation: ops.Activation, transmittance_bound: float
+        self, march: ops.MarchArguments, activation: ops.Activation, transmittance_bound: float
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         opened = _open_components(self.density_lines)
         return ops.cp_march_density(march, activation, transmittance_bound, list(self.density_lines), opened)

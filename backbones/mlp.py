@@ -17,7 +17,7 @@ from gridreg.encodings import octaves_of_channels
 from gridreg.ops import rays as backends
 from gridreg.ops.cpu.adam.optimizer import FusedAdam
 from gridreg.ops.linear import Precision
-from gridreg.rendering import Marched, OccupancyGrid, Rays
+from gridreg.rendering import OccupancyGrid, RayMarchResult, Rays
 
 __all__ = ["MLPField"]
 
@@ -184,7 +184,7 @@ class MLPField(nn.Module):
         occupancy: OccupancyGrid,
         jitter: Tensor,
         transmittance_bound: float,
-    ) -> Marched:
+    ) -> RayMarchResult:
         """Coarse and fine samples of rays, and the density at all of them.
 
         The coarse samples are evenly spread, and looked at without gradient; the fine ones follow their weights (NeRF,
@@ -215,7 +215,7 @@ class MLPField(nn.Module):
             density = self._density_of(features)
         else:
             features, density = None, self.density(x)
-        return Marched(
+        return RayMarchResult(
             offsets, index, t[ray, index], x, density, delta, met.long() * t.shape[1], features=features
         )
 

@@ -15,7 +15,7 @@ from backbones.decoders import Basis, make_decoder
 from gridreg import ops
 from gridreg.attach.sites import Site
 from gridreg.ops.cpu.adam.optimizer import FusedAdam
-from gridreg.rendering import Marched, OccupancyGrid, Rays
+from gridreg.rendering import OccupancyGrid, RayMarchResult, Rays
 
 __all__ = ["TensorialField", "density_shift_for"]
 
@@ -148,8 +148,8 @@ class TensorialField(nn.Module):
         occupancy: OccupancyGrid,
         jitter: Tensor,
         transmittance_bound: float,
-    ) -> Marched:
-        """March, density and early termination in one: see `gridreg.rendering.March` and `Marched`.
+    ) -> RayMarchResult:
+        """March, density and early termination in one: see `gridreg.rendering.MarchSettings` and `RayMarchResult`.
 
         Args:
             rays: ``R`` rays.
@@ -159,14 +159,14 @@ class TensorialField(nn.Module):
             jitter: ``(R,)`` in [0, 1).
             transmittance_bound: samples behind this transmittance are dropped.
         """
-        march = ops.March(
+        march = ops.MarchArguments(
             rays.origins, rays.directions, t_min, t_max, step, occupancy.cells, occupancy.bounds, jitter
         )
         activation = ops.Activation(self.bounds, self.density_shift, self.distance_scale)
-        return Marched(*self._marched(march, activation, transmittance_bound))
+        return RayMarchResult(*self._marched(march, activation, transmittance_bound))
 
     def _marched(
-        self, march: ops.March, activation: ops.Activation, transmittance_bound: float
+        self, march: ops.MarchArguments, activation: ops.Activation, transmittance_bound: float
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         raise TypeError(f"{type(self).__name__} must define _marched")
 

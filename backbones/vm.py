@@ -73,7 +73,7 @@ class VMField(TensorialField):
         return ops.vm_features(u, planes, lines, opened, dtype)
 
     def _marched(
-        self, march: ops.March, activation: ops.Activation, transmittance_bound: float
+        self, march: ops.MarchArguments, activation: ops.Activation, transmittance_bound: float
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         opened = _open_components(self.density_planes, self.density_lines)
         return ops.vm_march_density(

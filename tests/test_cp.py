@@ -11,7 +11,7 @@ from backbones.cp import LINE_AXES, CPField
 from gridreg.fields import make_field
 from gridreg.ops import grid_reference as reference
 from gridreg.ops.rays import use_backend
-from gridreg.rendering import March, OccupancyGrid, Rays, render_rays
+from gridreg.rendering import MarchSettings, OccupancyGrid, Rays, render_rays
 
 BOX = torch.tensor([[-1.0, -2.0, 0.0], [1.0, 1.0, 3.0]])
 LETTERS = "xyz"
@@ -279,7 +279,7 @@ def test_marching_in_one_call_is_marching_step_by_step(backend, seed, bound, vis
         for one in (field, Apart(field)):
             field.zero_grad()
             out = render_rays(
-                one, rays, grid, March(0.07, transmittance_bound=bound), background=torch.ones(3)
+                one, rays, grid, MarchSettings(0.07, transmittance_bound=bound), background=torch.ones(3)
             )
             out.opacity.square().sum().backward()
             gradients = [field.density_lines._parameters[str(k)].grad.clone() for k in range(3)]
@@ -307,7 +307,7 @@ def test_a_few_steps_of_training_bring_a_picture_closer():
     )
     losses = []
     for _ in range(25):
-        rendered = render_rays(field, rays, grid, March(0.1), background=torch.ones(3))
+        rendered = render_rays(field, rays, grid, MarchSettings(0.1), background=torch.ones(3))
         loss = (rendered.colour - colours).square().mean()
         optimizer.zero_grad()
         loss.backward()

@@ -15,7 +15,7 @@ from gridreg.cli import main
 from gridreg.errors import InputError
 from gridreg.export import model_of_run
 from gridreg.export.preview import Preview
-from gridreg.rendering import Ensemble, March, OccupancyGrid, Rays, render_rays
+from gridreg.rendering import Ensemble, MarchSettings, OccupancyGrid, Rays, render_rays
 from gridreg.scenes import builtin_scene, load_scene
 from gridreg.training import RunConfig, TrainSettings, execute, load_run, save_ensemble
 
@@ -57,7 +57,7 @@ def test_where_nothing_is_colour_is_the_plain_mean():
 def test_an_ensemble_of_one_renders_as_its_member():
     member = Flat(1.5, (0.2, 0.4, 0.6))
     rays = Rays(torch.tensor([[0.0, 0.1, -3.0]]), torch.tensor([[0.0, 0.0, 1.0]]))
-    march, black = March(0.1), torch.zeros(3)
+    march, black = MarchSettings(0.1), torch.zeros(3)
     alone = render_rays(member, rays, full(), march, background=black)
     joined = render_rays(Ensemble([member], [full()]), rays, full(), march, background=black)
     torch.testing.assert_close(joined.colour, alone.colour)

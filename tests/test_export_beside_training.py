@@ -16,7 +16,7 @@ from gridreg.export.cameras import Lens, orbit_of_box
 from gridreg.export.model import Model
 from gridreg.export.preview import Preview
 from gridreg.export.viewer import Viewer
-from gridreg.rendering import March, OccupancyGrid, Rays, render_rays
+from gridreg.rendering import MarchSettings, OccupancyGrid, Rays, render_rays
 from tests.export_viewing import FakeClient
 
 BOUNDS = torch.tensor([[-1.0] * 3, [1.0] * 3])
@@ -46,7 +46,7 @@ class Run:
 
     @property
     def model(self) -> Model:
-        march = March(step=0.5 * self.field.voxel_size())
+        march = MarchSettings(step=0.5 * self.field.voxel_size())
         return Model(self.field, OccupancyGrid.full(BOUNDS, (4, 4, 4)), march, torch.ones(3), self.handle)
 
     def iterate(self) -> None:

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from torch import nn
 
 from backbones.hierarchical import intervals, inverse_transform, stratified
-from gridreg.rendering import March, Marched, OccupancyGrid, Rays, render_rays
+from gridreg.rendering import MarchSettings, OccupancyGrid, RayMarchResult, Rays, render_rays
 
 RAYS = st.integers(1, 4)
 SEEDS = st.integers(0, 1000)
@@ -86,7 +86,7 @@ def test_intervals_meet_half_way_and_fill_the_ray(count, seed):
 class Fog(nn.Module):
     """The same density and colour everywhere, sampled by a march of its own."""
 
-    def __init__(self, positions, answer=Marched):
+    def __init__(self, positions, answer=RayMarchResult):
         super().__init__()
         self.register_buffer("bounds", torch.tensor([[-1.0] * 3, [1.0] * 3]))
         self.level = nn.Parameter(torch.tensor(0.8))
@@ -119,11 +119,11 @@ def rays_along_x(count=3):
 
 def rendered(field, **options):
     grid = OccupancyGrid.full(field.bounds, (2, 2, 2))
-    march = March(0.01, transmittance_bound=0.0, weight_bound=0.0)
+    march = MarchSettings(0.01, transmittance_bound=0.0, weight_bound=0.0)
     return render_rays(field, rays_along_x(), grid, march, background=torch.ones(3), **options)
 
 
-@pytest.mark.parametrize("answer", [Marched, lambda *tensors: tensors])
+@pytest.mark.parametrize("answer", [RayMarchResult, lambda *tensors: tensors])
 def test_samples_of_unequal_length_are_composited_by_their_own(answer):
     field = Fog(torch.tensor([0.05, 0.1, 0.4, 0.9]), answer)
     out = rendered(field)
@@ -142,7 +142,7 @@ def test_samples_of_unequal_length_are_composited_by_their_own(answer):
 def test_a_march_may_count_skipped_samples_and_bring_features():
     def answer(*tensors):
         features = torch.arange(12.0)[:, None] / 12
-        return Marched(*tensors, ray_steps=torch.tensor([7, 7, 7]), features=features)
+        return RayMarchResult(*tensors, ray_steps=torch.tensor([7, 7, 7]), features=features)
 
     field = Fog(torch.tensor([0.1, 0.2, 0.5, 0.7]), answer)
     out = rendered(field)

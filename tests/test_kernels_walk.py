@@ -33,7 +33,7 @@ def make_scene(seed, rays, step, fill):
     cell_bounds = torch.tensor([[-1.5, -1.5, -1.5], [1.5, 1.5, 1.5]])
     t_min, t_max = torch.full((rays,), 1.0), torch.rand(rays, generator=g) * 4 + 1
     bounds = torch.tensor([[-1.5, -1.2, -1.5], [1.4, 1.5, 1.5]])
-    march = ops.March(
+    march = ops.MarchArguments(
         origins, directions, t_min, t_max, step, cells, cell_bounds, torch.rand(rays, generator=g)
     )
     return march, bounds

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 import gridreg
 from backbones.mlp import MLPField
 from gridreg.fields import make_field
-from gridreg.rendering import March, OccupancyGrid, Rays, box_intersection, render_image, render_rays
+from gridreg.rendering import MarchSettings, OccupancyGrid, Rays, box_intersection, render_image, render_rays
 from gridreg.scenes import builtin_scene, load_scene
 from gridreg.training import RunConfig, TrainSettings, build_trainer, load_run, save_run
 
@@ -268,7 +268,7 @@ def test_an_untrained_field_renders_to_its_opacity_whatever_the_sampling():
     rays = rays_at()
     t_min, t_max = box_intersection(rays, BOX)
     grid = OccupancyGrid.full(BOX, (1, 1, 1))
-    march = March(0.5, transmittance_bound=0.0, weight_bound=0.0)
+    march = MarchSettings(0.5, transmittance_bound=0.0, weight_bound=0.0)
     out = render_rays(field, rays, grid, march, background=torch.ones(3))
     level = float(field.density(points(1)[0]).detach())
     torch.testing.assert_close(out.opacity, 1 - torch.exp(-level * (t_max - t_min)), atol=1e-5, rtol=1e-5)
@@ -284,7 +284,7 @@ def test_an_untrained_field_renders_to_its_opacity_whatever_the_sampling():
 def test_occlusion_counts_the_first_samples_of_each_ray():
     field = small(trained=False)
     grid = OccupancyGrid.full(BOX, (1, 1, 1))
-    out = render_rays(field, rays_at(), grid, March(0.5), background=torch.ones(3))
+    out = render_rays(field, rays_at(), grid, MarchSettings(0.5), background=torch.ones(3))
     level = float(field.density(points(1)[0]).detach())
     found = gridreg.occlusion_loss(out.samples, 4).detach()
     assert float(found) == pytest.approx(level * 4 / 16, rel=1e-5)
@@ -295,7 +295,7 @@ def test_pictures_hardly_depend_on_the_chunk_size():
     pose = torch.eye(4)
     pose[:3, 3] = torch.tensor([0.0, -0.5, 7.0])
     grid = OccupancyGrid.full(BOX, (4, 4, 4))
-    camera = (pose, torch.tensor([12.0, 12.0, 4.0, 4.0]), 8, 8, grid, March(0.5))
+    camera = (pose, torch.tensor([12.0, 12.0, 4.0, 4.0]), 8, 8, grid, MarchSettings(0.5))
     one, two = (render_image(field, *camera, background=torch.ones(3), chunk=c).colour for c in (64, 5))
     torch.testing.assert_close(one, two, atol=1e-5, rtol=0)
     assert float(one.std()) > 0.01

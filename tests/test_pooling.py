@@ -10,7 +10,7 @@ from torch import Tensor, nn
 import gridreg.ops  # noqa: F401  (registers the compiled pools)
 from gridreg.ops import rays as backends
 from gridreg.ops.pooling import pool_faint
-from gridreg.rendering import March, OccupancyGrid, Rays, render, render_rays
+from gridreg.rendering import MarchSettings, OccupancyGrid, Rays, render, render_rays
 
 
 def seeded(seed: int = 0) -> torch.Generator:
@@ -123,7 +123,7 @@ def rays_down(count: int) -> Rays:
 
 
 def picture(field: Fog, pool: float, generator: torch.Generator | None) -> Tensor:
-    march = March(0.01, weight_bound=1e-4, transmittance_bound=0.0, pool_weight=pool)
+    march = MarchSettings(0.01, weight_bound=1e-4, transmittance_bound=0.0, merge_weight=pool)
     grid = OccupancyGrid.full(field.bounds, (8, 8, 8))
     return render_rays(
         field, rays_down(16), grid, march, background=torch.ones(3), generator=generator
@@ -165,7 +165,7 @@ def test_fewer_colours_are_asked_for():
 
 def test_a_ray_does_not_depend_on_its_company():
     """Without a generator pools have the speaker at half of their weight, whatever else is rendered with the ray."""
-    field, march = Fog(), March(0.01, weight_bound=1e-4, transmittance_bound=0.0, pool_weight=0.02)
+    field, march = Fog(), MarchSettings(0.01, weight_bound=1e-4, transmittance_bound=0.0, merge_weight=0.02)
     grid, rays = OccupancyGrid.full(field.bounds, (8, 8, 8)), rays_down(16)
     together = render_rays(field, rays, grid, march, background=torch.ones(3)).colour
     for start, stop in ((0, 1), (3, 8), (8, 16)):

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import nn
 
-from gridreg.rendering import March, OccupancyGrid, Rays, render_image, render_rays
+from gridreg.rendering import MarchSettings, OccupancyGrid, Rays, render_image, render_rays
 
 
 class Sphere(nn.Module):
@@ -43,7 +43,7 @@ def test_opacity_and_colour_of_a_homogeneous_ball(radius, density, offset):
     grid = OccupancyGrid.full(field.bounds, (8, 8, 8))
     step = 1e-3
     out = render_rays(
-        field, parallel_rays(torch.tensor([offset])), grid, March(step, **EXACT), background=WHITE
+        field, parallel_rays(torch.tensor([offset])), grid, MarchSettings(step, **EXACT), background=WHITE
     )
     chord = 2 * math.sqrt(max(0.0, radius**2 - offset**2))
     opacity = 1 - math.exp(-density * chord)
@@ -59,7 +59,7 @@ def test_depth_of_a_homogeneous_ball(density, offset):
     field = Sphere(1.0, density)
     grid = OccupancyGrid.full(field.bounds, (8, 8, 8))
     out = render_rays(
-        field, parallel_rays(torch.tensor([offset])), grid, March(1e-3, **EXACT), background=WHITE
+        field, parallel_rays(torch.tensor([offset])), grid, MarchSettings(1e-3, **EXACT), background=WHITE
     )
     half = math.sqrt(1 - offset**2)
     enter, chord = 3.0 - half, 2 * half
@@ -72,7 +72,9 @@ def test_depth_of_a_homogeneous_ball(density, offset):
 def test_gradient_of_opacity_is_the_analytic_one():
     field = Sphere(1.0, 0.7)
     grid = OccupancyGrid.full(field.bounds, (8, 8, 8))
-    out = render_rays(field, parallel_rays(torch.tensor([0.0])), grid, March(1e-3, **EXACT), background=WHITE)
+    out = render_rays(
+        field, parallel_rays(torch.tensor([0.0])), grid, MarchSettings(1e-3, **EXACT), background=WHITE
+    )
     out.opacity.sum().backward()
     assert field.level.grad.item() == pytest.approx(2 * math.exp(-1.4), rel=2e-3)
 
@@ -84,8 +86,8 @@ def test_empty_cells_are_skipped_and_leave_the_picture_alone():
     pruned.update(field.density, step=0.05)
     assert 0 < pruned.fraction < 0.2
     rays = parallel_rays(torch.linspace(-1.4, 1.4, 57))
-    one = render_rays(field, rays, full, March(0.01), background=WHITE)
-    two = render_rays(field, rays, pruned, March(0.01), background=WHITE)
+    one = render_rays(field, rays, full, MarchSettings(0.01), background=WHITE)
+    two = render_rays(field, rays, pruned, MarchSettings(0.01), background=WHITE)
     torch.testing.assert_close(one.colour, two.colour, atol=1e-5, rtol=0)
     assert len(two.samples) < 0.6 * len(one.samples)
 
@@ -95,9 +97,9 @@ def test_early_termination_changes_a_pixel_by_at_most_its_bound(bound, density):
     field = Sphere(1.2, density)
     grid = OccupancyGrid.full(field.bounds, (8, 8, 8))
     rays = parallel_rays(torch.linspace(-1.3, 1.3, 27))
-    exact = render_rays(field, rays, grid, March(0.02, **EXACT), background=WHITE)
+    exact = render_rays(field, rays, grid, MarchSettings(0.02, **EXACT), background=WHITE)
     cut = render_rays(
-        field, rays, grid, March(0.02, transmittance_bound=bound, weight_bound=0.0), background=WHITE
+        field, rays, grid, MarchSettings(0.02, transmittance_bound=bound, weight_bound=0.0), background=WHITE
     )
     assert (exact.colour - cut.colour).abs().max() <= bound + 1e-5
     assert len(cut.samples) <= len(exact.samples)
@@ -107,7 +109,9 @@ def test_background_shows_where_nothing_is():
     field = Sphere(0.2)
     grid = OccupancyGrid.full(field.bounds, (8, 8, 8))
     behind = torch.rand(5, 3, generator=torch.Generator().manual_seed(1))
-    out = render_rays(field, parallel_rays(torch.full((5,), 1.2)), grid, March(0.05), background=behind)
+    out = render_rays(
+        field, parallel_rays(torch.full((5,), 1.2)), grid, MarchSettings(0.05), background=behind
+    )
     torch.testing.assert_close(out.colour, behind)
     assert out.opacity.abs().max() == 0
 
@@ -115,7 +119,7 @@ def test_background_shows_where_nothing_is():
 def test_a_ray_that_misses_the_box_has_no_samples():
     field = Sphere()
     grid = OccupancyGrid.full(field.bounds, (4, 4, 4))
-    out = render_rays(field, parallel_rays(torch.tensor([7.0])), grid, March(0.1), background=WHITE)
+    out = render_rays(field, parallel_rays(torch.tensor([7.0])), grid, MarchSettings(0.1), background=WHITE)
     assert len(out.samples) == 0
     torch.testing.assert_close(out.colour, torch.ones(1, 3))
 
@@ -130,7 +134,9 @@ def test_pictures_do_not_depend_on_the_chunk_size():
     field, (pose, intrinsics) = Sphere(), camera()
     grid = OccupancyGrid.full(field.bounds, (8, 8, 8))
     pictures = [
-        render_image(field, pose, intrinsics, 24, 32, grid, March(0.05), background=WHITE, chunk=chunk)
+        render_image(
+            field, pose, intrinsics, 24, 32, grid, MarchSettings(0.05), background=WHITE, chunk=chunk
+        )
         for chunk in (7, 100, 10_000)
     ]
     for other in pictures[1:]:
@@ -143,7 +149,7 @@ def test_a_picture_is_not_mirrored():
     field.register_buffer("centre", torch.tensor([0.8, 0.5, 0.0]))
     field.density = lambda x: torch.where((x - field.centre).norm(dim=-1) < 0.3, 30.0, 0.0)
     grid = OccupancyGrid.full(field.bounds, (8, 8, 8))
-    out = render_image(field, pose, intrinsics, 24, 32, grid, March(0.05), background=WHITE)
+    out = render_image(field, pose, intrinsics, 24, 32, grid, MarchSettings(0.05), background=WHITE)
     rows, columns = (out.opacity > 0.5).nonzero(as_tuple=True)
     # x = 0.8, y = 0.5 at depth about 4: right of the centre and above it.
     assert columns.float().mean().item() + 0.5 == pytest.approx(16 + 40 * 0.8 / 4, abs=0.8)

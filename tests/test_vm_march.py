@@ -9,7 +9,7 @@ from torch.nn import functional as F
 import gridreg
 from backbones.vm import VMField
 from gridreg.ops.rays import use_backend
-from gridreg.rendering import March, OccupancyGrid, Rays, render_rays
+from gridreg.rendering import MarchSettings, OccupancyGrid, Rays, render_rays
 
 BOX = torch.tensor([[-1.0, -2.0, 0.0], [1.0, 1.0, 3.0]])
 
@@ -66,7 +66,7 @@ def test_marching_in_one_call_is_marching_step_by_step(backend, seed, bound, vis
     ):
         for one in (field, Apart(field)):
             field.zero_grad()
-            march = March(0.07, transmittance_bound=bound)
+            march = MarchSettings(0.07, transmittance_bound=bound)
             out = render_rays(one, rays, grid, march, background=torch.ones(3))
             out.opacity.square().sum().backward()
             assert len(out.samples) > 0
@@ -96,7 +96,7 @@ def test_a_mask_on_some_factors_closes_only_their_products(globs):
         for backend in ("torch", "auto"):
             with use_backend(backend):
                 density = field.density(rays.origins + 5 * rays.directions).detach()
-                out = render_rays(field, rays, grid, March(0.1), background=torch.ones(3))
+                out = render_rays(field, rays, grid, MarchSettings(0.1), background=torch.ones(3))
                 results.append([density, out.opacity.detach()])
         # What the masked factors, written out, give.
         plain = small()
@@ -118,7 +118,7 @@ def test_a_subclass_with_its_own_density_is_marched_through_it():
 
     field, plain, rays = small(cls=Doubled), small(), some_rays(1)
     grid = OccupancyGrid.full(BOX, (6, 6, 6))
-    march = March(0.1, transmittance_bound=0.0)
+    march = MarchSettings(0.1, transmittance_bound=0.0)
     doubled = render_rays(field, rays, grid, march, background=torch.ones(3)).samples.density
     single = render_rays(plain, rays, grid, march, background=torch.ones(3)).samples.density
     torch.testing.assert_close(doubled, 2 * single)

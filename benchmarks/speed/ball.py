@@ -11,7 +11,7 @@ from torch import Tensor
 import gridreg
 from gridreg.base import Regularizer
 from gridreg.fields import make_field
-from gridreg.rendering import March, OccupancyGrid, Rays, Rendered, render_rays
+from gridreg.rendering import MarchSettings, OccupancyGrid, Rays, Rendered, render_rays
 
 from .situations import cells_of
 
@@ -91,7 +91,7 @@ class BallStep:
         edge = field.resolution[0]
         self.field, self.rays, self.at = field, rays, at
         # Half a cell, as in the published schedule.
-        self.march = March(step=1.0 / (edge - 1), weight_bound=weight_bound)
+        self.march = MarchSettings(step=1.0 / (edge - 1), weight_bound=weight_bound)
         full = OccupancyGrid.full(BOX, (64, 64, 64))
         self.occupancy = full if everywhere else cells_of(field.density, BOX, self.march.step)
         self.optimizer = field.make_optimizer(

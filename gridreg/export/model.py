@@ -12,7 +12,7 @@ from torch import Tensor
 from gridreg import Handle
 from gridreg.errors import InputError
 from gridreg.export.cameras import Camera
-from gridreg.rendering import March, OccupancyGrid, Rays, Rendered, camera_rays, render_rays
+from gridreg.rendering import MarchSettings, OccupancyGrid, Rays, Rendered, camera_rays, render_rays
 
 __all__ = ["Model"]
 
@@ -38,7 +38,7 @@ class Model:
 
     field: Any
     occupancy: OccupancyGrid
-    march: March
+    march: MarchSettings
     background: Tensor = field(default_factory=_white)
     handle: Handle | None = None
     warp: Callable[[Rays], Rays] | None = None
@@ -57,7 +57,7 @@ class Model:
         bounds: Tensor = field.bounds
         step = 0.5 * float((bounds[1] - bounds[0]).max()) / resolution
         colour = torch.ones(3, device=bounds.device) if background is None else background.to(bounds.device)
-        return cls(field, OccupancyGrid.full(bounds, (1, 1, 1)), March(step), colour)
+        return cls(field, OccupancyGrid.full(bounds, (1, 1, 1)), MarchSettings(step), colour)
 
     @torch.no_grad()
     def render(

@@ -8,7 +8,7 @@ from gridreg.ops.encode import encode, encode_together
 from gridreg.ops.encoded_mlp import Block, encoded_mlp
 from gridreg.ops.grid_lookup import (
     Activation,
-    March,
+    MarchArguments,
     cp_density,
     cp_features,
     cp_march_density,
@@ -22,7 +22,7 @@ __all__ = [
     "Activation",
     "Block",
     "Layer",
-    "March",
+    "MarchArguments",
     "accumulate_into_grad",
     "cp_density",
     "cp_features",

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-__all__ = ["Activation", "March"]
+__all__ = ["Activation", "MarchArguments"]
 
 
 class Activation(NamedTuple):
@@ -23,7 +23,7 @@ class Activation(NamedTuple):
     scale: float
 
 
-class March(NamedTuple):
+class MarchArguments(NamedTuple):
     """Arguments of `gridreg.ops.rays.march`, which explains them."""
 
     origins: Tensor

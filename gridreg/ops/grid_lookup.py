@@ -10,13 +10,13 @@ from torch import Tensor
 from gridreg.errors import InputError
 from gridreg.ops import grid_reference as reference
 from gridreg.ops import ray_reference as plain
-from gridreg.ops.arguments import Activation, March
+from gridreg.ops.arguments import Activation, MarchArguments
 from gridreg.ops.cpu import autograd
 from gridreg.ops.rays import chosen_backend
 
 __all__ = [
     "Activation",
-    "March",
+    "MarchArguments",
     "cp_density",
     "cp_features",
     "cp_march_density",
@@ -122,7 +122,7 @@ def cp_features(u: Tensor, lines: Sequence[Tensor], open_channels: int | None = 
     return reference.cp_features(u, lines, open_channels)
 
 
-def _check_march(march: March, activation: Activation, transmittance_bound: float) -> None:
+def _check_march(march: MarchArguments, activation: Activation, transmittance_bound: float) -> None:
     plain.check_march(*march)
     if tuple(activation.bounds.shape) != (2, 3):
         raise InputError(f"activation.bounds: found shape {tuple(activation.bounds.shape)}, expected (2, 3)")
@@ -133,7 +133,7 @@ def _check_march(march: March, activation: Activation, transmittance_bound: floa
 
 
 def vm_march_density(
-    march: March,
+    march: MarchArguments,
     activation: Activation,
     transmittance_bound: float,
     planes: Sequence[Tensor],
@@ -172,7 +172,7 @@ def vm_march_density(
 
 
 def cp_march_density(
-    march: March,
+    march: MarchArguments,
     activation: Activation,
     transmittance_bound: float,
     lines: Sequence[Tensor],
@@ -189,7 +189,7 @@ def cp_march_density(
     )
 
 
-def _tensors(march: March, activation: Activation) -> list[Tensor]:
+def _tensors(march: MarchArguments, activation: Activation) -> list[Tensor]:
     jitter = [march.jitter] if isinstance(march.jitter, Tensor) else []
     return [
         march.origins,

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from gridreg.ops import ray_reference as plain
-from gridreg.ops.arguments import Activation, March
+from gridreg.ops.arguments import Activation, MarchArguments
 
 __all__ = [
     "LINE_AXES",
@@ -101,7 +101,10 @@ def cp_density(u: Tensor, lines: Sequence[Tensor], open_channels: int | None = N
 
 
 def march_density(
-    march: March, activation: Activation, transmittance_bound: float, features: Callable[[Tensor], Tensor]
+    march: MarchArguments,
+    activation: Activation,
+    transmittance_bound: float,
+    features: Callable[[Tensor], Tensor],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """See `gridreg.ops.vm_march_density`; ``features`` maps normalised positions to density features."""
     offsets, index, t, positions = plain.march(*march)

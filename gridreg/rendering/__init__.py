@@ -5,8 +5,8 @@ from gridreg.rendering.occupancy import OccupancyGrid, visual_hull
 from gridreg.rendering.rays import Rays, box_intersection, camera_rays, pixel_rays
 from gridreg.rendering.render import (
     Field,
-    March,
-    Marched,
+    MarchSettings,
+    RayMarchResult,
     Rendered,
     SampleHook,
     composite,
@@ -17,8 +17,8 @@ from gridreg.rendering.render import (
 __all__ = [
     "Ensemble",
     "Field",
-    "March",
-    "Marched",
+    "MarchSettings",
+    "RayMarchResult",
     "OccupancyGrid",
     "Rays",
     "Rendered",

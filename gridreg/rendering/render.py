@@ -14,7 +14,15 @@ from gridreg.rendering.occupancy import OccupancyGrid
 from gridreg.rendering.rays import Rays, box_intersection, camera_rays
 from gridreg.samples import RaySamples
 
-__all__ = ["Field", "March", "Marched", "Rendered", "SampleHook", "render_image", "render_rays"]
+__all__ = [
+    "Field",
+    "MarchSettings",
+    "RayMarchResult",
+    "Rendered",
+    "SampleHook",
+    "render_image",
+    "render_rays",
+]
 
 
 _BLOCK = 1 << 16
@@ -24,7 +32,7 @@ class Field(Protocol):
     """What the renderer asks of a field.
 
     It may also offer ``march_density(rays, t_min, t_max, step, occupancy, jitter, transmittance_bound)``, which returns
-    `Marched`; ``colour_of_rays(x, directions, ray_indices)``, which takes directions ``(R, 3)`` by ray; and
+    `RayMarchResult`; ``colour_of_rays(x, directions, ray_indices)``, which takes directions ``(R, 3)`` by ray; and
     ``colour_of_features(features, directions, ray_indices)`` for the features that its march returned.
     """
 
@@ -48,8 +56,8 @@ class SampleHook(Protocol):
 
 
 @dataclass(frozen=True)
-class March:
-    """How rays are walked.
+class MarchSettings:
+    """How rays are sampled (ray marching).
 
     Args:
         step: distance between samples, world units.
@@ -57,7 +65,7 @@ class March:
         transmittance_bound: samples behind this transmittance are dropped, unitless; the colour of a pixel
             changes by at most this much. 0 keeps them all.
         weight_bound: colour is evaluated only where the weight exceeds this (TensoRF uses 1e-4).
-        pool_weight: neighbours on a ray that weigh less than this share the colour of one of them, see
+        merge_weight: neighbours on a ray that weigh less than this share the colour of one of them, see
             `gridreg.ops.pooling`. 0: every sample has its own.
     """
 
@@ -66,7 +74,7 @@ class March:
     far: float = 1e10
     transmittance_bound: float = 1e-4
     weight_bound: float = 1e-4
-    pool_weight: float = 0.0
+    merge_weight: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -89,7 +97,7 @@ class Rendered:
 
 
 @dataclass(frozen=True)
-class Marched:
+class RayMarchResult:
     """The samples that a march kept, packed by ray, and their density.
 
     A field's own `march_density` may return a plain tuple of the first five or more.
@@ -121,15 +129,15 @@ def _march(
     rays: Rays,
     t_range: tuple[Tensor, Tensor],
     occupancy: OccupancyGrid,
-    march: March,
+    march: MarchSettings,
     jitter: Tensor,
-) -> Marched:
+) -> RayMarchResult:
     """The samples that are not hidden."""
     t_min, t_max = t_range
     fused = getattr(field, "march_density", None)
     if fused is not None:
         found = fused(rays, t_min, t_max, march.step, occupancy, jitter, march.transmittance_bound)
-        return found if isinstance(found, Marched) else Marched(*found)
+        return found if isinstance(found, RayMarchResult) else RayMarchResult(*found)
     offsets, index, t, positions = backends.march(
         rays.origins, rays.directions, t_min, t_max, march.step, occupancy.cells, occupancy.bounds, jitter
     )
@@ -138,7 +146,7 @@ def _march(
         kept = backends.terminate(density.detach() * march.step, offsets, march.transmittance_bound)
         offsets = _offsets_of(kept, offsets)
         index, t, positions, density = index[kept], t[kept], positions[kept], density[kept]
-    return Marched(offsets, index, t, positions, density)
+    return RayMarchResult(offsets, index, t, positions, density)
 
 
 def _offsets_of(kept: Tensor, offsets: Tensor) -> Tensor:
@@ -147,7 +155,7 @@ def _offsets_of(kept: Tensor, offsets: Tensor) -> Tensor:
     return running[offsets]
 
 
-def _colours(field: Any, marched: Marched, chosen: Tensor, rays: Rays, ray_indices: Tensor) -> Tensor:
+def _colours(field: Any, marched: RayMarchResult, chosen: Tensor, rays: Rays, ray_indices: Tensor) -> Tensor:
     """Colours of some of the samples; without gradients in blocks, which bounds the memory of a picture's fog."""
     if not torch.is_grad_enabled() and len(chosen) > _BLOCK:
         parts = zip(torch.split(chosen, _BLOCK), torch.split(ray_indices, _BLOCK), strict=True)
@@ -169,7 +177,7 @@ def render_rays(
     field: Any,
     rays: Rays,
     occupancy: OccupancyGrid,
-    march: March,
+    march: MarchSettings,
     *,
     background: Tensor,
     jitter: Tensor | None = None,
@@ -188,7 +196,7 @@ def render_rays(
         jitter: ``(R,)`` in [0, 1), the share of a step by which each ray's samples are shifted; None: 0.5.
         near_far: ``(R,)`` each, instead of the march's near and far.
         hook: gets the samples before they are composited.
-        generator: for training: draws whose colour a pool has (the march's ``pool_weight``); None: that of the sample
+        generator: for training: draws whose colour a pool has (the march's ``merge_weight``); None: that of the sample
             at half of the pool's weight.
     """
     if jitter is None:
@@ -213,7 +221,7 @@ def render_rays(
         ray_steps=ray_steps,
     )
     coloured, of_rays, pools = backends.pool(
-        samples.weights.detach(), samples.offsets, march.weight_bound, march.pool_weight, generator
+        samples.weights.detach(), samples.offsets, march.weight_bound, march.merge_weight, generator
     )
     spoken = _colours(field, marched, coloured, rays, of_rays)
     colours = backends.spread(spoken, pools, coloured)
@@ -241,7 +249,7 @@ def render_image(
     height: int,
     width: int,
     occupancy: OccupancyGrid,
-    march: March,
+    march: MarchSettings,
     *,
     background: Tensor,
     chunk: int = 1 << 13,

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gridreg.rendering import March, OccupancyGrid, Rays, Rendered, render_image
+from gridreg.rendering import MarchSettings, OccupancyGrid, Rays, Rendered, render_image
 from gridreg.scenes import Views
 from gridreg.training.metrics import image_metrics, psnr
 
@@ -37,7 +37,7 @@ def render_views(
     field: Any,
     views: Views,
     occupancy: OccupancyGrid,
-    march: March,
+    march: MarchSettings,
     background: Tensor,
     *,
     warp: Callable[[Rays], Rays] | None = None,
@@ -61,7 +61,7 @@ def score_views(
     field: Any,
     views: Views,
     occupancy: OccupancyGrid,
-    march: March,
+    march: MarchSettings,
     background: Tensor,
     each: Callable[[Scored], None] | None = None,
     *,
@@ -83,7 +83,7 @@ def mean_psnr_of(
     field: Any,
     views: Views,
     occupancy: OccupancyGrid,
-    march: March,
+    march: MarchSettings,
     background: Tensor,
     stride: int = 1,
     *,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from gridreg.errors import InputError
-from gridreg.rendering import March, OccupancyGrid, visual_hull
+from gridreg.rendering import MarchSettings, OccupancyGrid, visual_hull
 from gridreg.training.rays import meets
 
 if TYPE_CHECKING:
@@ -38,15 +38,15 @@ def cell_size(field: Any) -> float:
     return float(((field.bounds[1] - field.bounds[0]).cpu() / (nodes - 1)).mean())
 
 
-def march_of(field: Any, settings: TrainSettings, near: float, far: float) -> March:
+def march_of(field: Any, settings: TrainSettings, near: float, far: float) -> MarchSettings:
     """How rays are walked at a field's present resolution, between two distances, world units."""
-    return March(
+    return MarchSettings(
         step=settings.step_ratio * cell_size(field),
         near=near,
         far=far,
         transmittance_bound=settings.transmittance_bound,
         weight_bound=settings.weight_bound,
-        pool_weight=settings.pool_weight,
+        merge_weight=settings.pool_weight,
     )
 
 

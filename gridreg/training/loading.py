@@ -13,7 +13,7 @@ import gridreg
 from gridreg.attach.handle import Handle
 from gridreg.errors import InputError
 from gridreg.fields import make_field
-from gridreg.rendering import Ensemble, March, OccupancyGrid
+from gridreg.rendering import Ensemble, MarchSettings, OccupancyGrid
 from gridreg.training import events
 from gridreg.training.checkpoint import has_checkpoint, load_checkpoint
 from gridreg.training.config import from_data
@@ -45,7 +45,7 @@ class LoadedRun:
 
     field: Any
     occupancy: OccupancyGrid
-    march: March
+    march: MarchSettings
     background: torch.Tensor
     config: RunConfig
     step: int

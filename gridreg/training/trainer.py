@@ -15,7 +15,7 @@ from torch import Tensor, nn
 import gridreg
 from gridreg.base import Regularizer
 from gridreg.errors import InputError
-from gridreg.rendering import March, OccupancyGrid, Rays, Rendered, render_rays
+from gridreg.rendering import MarchSettings, OccupancyGrid, Rays, Rendered, render_rays
 from gridreg.scenes import Scene
 from gridreg.training import events
 from gridreg.training.averaging import WeightAverage
@@ -82,7 +82,7 @@ class Trainer:
         return self.settings.carve and not self.scene.ndc
 
     @property
-    def march(self) -> March:
+    def march(self) -> MarchSettings:
         """How rays are walked at the field's present resolution."""
         return events.march_of(self.field, self.settings, self.scene.near, self.scene.far)
 

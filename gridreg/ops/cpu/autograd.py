@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gridreg.ops.arguments import Activation, March
+from gridreg.ops.arguments import Activation, MarchArguments
 from gridreg.ops.cpu import cp, vm, vm_gradient
 from gridreg.ops.cpu.jit.simd import LANES
 from gridreg.ops.cpu.march import mark
@@ -144,7 +144,7 @@ class _Activated(torch.autograd.Function):
 
 
 def march_density(
-    march: March,
+    march: MarchArguments,
     activation: Activation,
     transmittance_bound: float,
     planes: Sequence[Tensor],
