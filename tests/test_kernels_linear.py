@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -11,6 +12,7 @@ from hypothesis import strategies as st
 
 from gridreg.errors import InputError
 from gridreg.ops import linear
+from gridreg.ops.cpu.mlp import chain
 from gridreg.ops.linear import Layer, bfloat16_is_fast, mlp
 from gridreg.ops.rays import use_backend
 
@@ -100,6 +102,27 @@ def test_without_onednn(monkeypatch):
     monkeypatch.setattr(linear.torch._C, "_has_mkldnn", False)
     expected = by_hand(x.double(), doubles(layers))
     compare(mlp(x, layers, precision="float32"), expected, (x, *[t for p in layers for t in p]), 1e-5, 1e-4)
+
+
+@pytest.mark.parametrize("supported", [False, True])
+def test_onednn_is_asked_for_bfloat16_only_where_it_takes_it(monkeypatch, supported):
+    """Without AVX-512 it raises, so torch's own product serves; float32 it always takes."""
+    asked = []
+
+    def stand_in(x, weight, bias, then, scalars, algorithm):
+        asked.append(x.dtype)
+        found = torch.nn.functional.linear(x, weight, bias)
+        return found.relu() if then == "relu" else found
+
+    known = SimpleNamespace(_linear_pointwise=stand_in, _is_mkldnn_bf16_supported=lambda: supported)
+    monkeypatch.setattr(chain.torch.ops, "mkldnn", known)
+    x, weight, bias = draw(6, 4), draw(5, 4, seed=1), draw(5, seed=2)
+    expected = (x @ weight.T + bias).clamp(min=0)
+    torch.testing.assert_close(chain.product(x, weight, bias, True), expected)
+    low = chain.product(x.bfloat16(), weight.bfloat16(), bias.bfloat16(), True)
+    assert low.dtype == torch.bfloat16
+    torch.testing.assert_close(low.float(), expected, atol=0.03, rtol=0.03)
+    assert asked == [torch.float32] + [torch.bfloat16] * supported
 
 
 def test_plain_path():

@@ -16,7 +16,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gridreg.ops import Block, encoded_mlp
-from gridreg.ops import encoded_mlp as encoded
 from gridreg.ops.cpu.jit.compiler import float32, kernel, next_task, uint16, vector
 from gridreg.ops.cpu.jit.launch import launch
 from gridreg.ops.cpu.jit.simd import LANES, load, wide
@@ -79,7 +78,7 @@ def test_one_kernel_is_the_layers_one_by_one(precision, count, dims, octaves, hi
     assert fits(blocks, layers, DTYPES[precision])
     fused = results(blocks, layers, wanted, precision)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(encoded, "fits", lambda blocks, layers, dtype: False)
+        patch.setattr(sys.modules[encoded_mlp.__module__], "fits", lambda blocks, layers, dtype: False)
         apart = results(blocks, layers, wanted, precision)
     # Biases of the first layer are rounded there and not here; a unit may cross the edge of its ReLU.
     value, slope = (0.01, 0.1) if precision == "bfloat16" else (1e-5, 1e-3)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
@@ -13,7 +14,6 @@ import torch
 
 import gridreg.training.trainer as trainer_module
 from gridreg import ops
-from gridreg.ops import encoded_mlp as encoded
 from gridreg.ops import linear
 from gridreg.ops import ray_reference as plain
 from gridreg.ops import rays as backends
@@ -128,7 +128,7 @@ def places_of(trainer: Trainer) -> list[Place]:
         Place(cp, "density_backward", "backward/density"),
         Place(vm_gradient, "features_backward", "backward/lookup"),
         Place(cp, "features_backward", "backward/lookup"),
-        Place(encoded, "chain_backward", "backward/network"),
+        Place(sys.modules[ops.encoded_mlp.__module__], "chain_backward", "backward/network"),
         Place(perceptron, "gradients", "backward/network"),
         Place(linear, "chain_backward", "backward/network"),
         Place(trainer.optimizer, "step", "optimiser"),

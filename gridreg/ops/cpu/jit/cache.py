@@ -40,8 +40,8 @@ def one_process(folder: str, name: str) -> Iterator[None]:
 
 @functools.cache
 def _sources() -> tuple[tuple[str, ...], str]:
-    """Names of the modules of this package and the digest of what they say."""
-    files = sorted(Path(__file__).parent.glob("*.py"))
+    """Names of the modules of `gridreg.ops` and the digest of what they say."""
+    files = sorted(Path(__file__).parents[2].rglob("*.py"))
     digest = hashlib.sha256()
     for file in files:
         digest.update(file.read_bytes())

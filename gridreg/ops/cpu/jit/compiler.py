@@ -67,6 +67,8 @@ _HELPER: dict[str, Any] = {**_OPTIONS, "no_cpython_wrapper": True, "no_cfunc_wra
 _TABLE = types.CPointer(types.int64)  # type: ignore[no-untyped-call]
 _WORD = ir.IntType(64)
 _COMPILING = threading.Lock()
+# The package whose kernels a second process knows.
+_OPERATIONS = "gridreg.ops."
 
 # Untyped: a call from a kernel has fewer arguments than the function that generates it.
 intrinsic: Any = extending.intrinsic
@@ -107,8 +109,10 @@ class Kernel:
     @property
     def cached(self) -> bool:
         """Whether a process has compiled the kernel, or is at it."""
-        folder = Path(self._folder)
-        return (folder / f"{self.name}.lock").exists()
+        folder = self._folder
+        with one_process(folder, "gridreg-kernels"):
+            forget_outdated(folder)
+        return (Path(folder) / f"{self.name}.lock").exists()
 
     def _compile(self) -> Any:
         compiled: Any = functools.partial(cfunc, types.void(_TABLE), fastmath=_FAST, **_OPTIONS)
@@ -118,7 +122,7 @@ class Kernel:
                 folder = self._folder
                 with one_process(folder, "gridreg-kernels"):
                     empty = forget_outdated(folder)
-                if empty and can_lock() and self.function.__module__.startswith(__package__):
+                if empty and can_lock() and self.function.__module__.startswith(_OPERATIONS):
                     _compile_ahead()
                 with one_process(folder, self.name):
                     return compiled(cache=True)(self.function)

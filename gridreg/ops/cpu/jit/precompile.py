@@ -16,7 +16,7 @@ import subprocess
 import sys
 
 from gridreg.cores import usable_cores
-from gridreg.ops.cpu.mlp.gemm_bf16 import available
+from gridreg.ops.cpu.mlp.gemm_tile import has
 
 __all__ = ["main", "start"]
 
@@ -83,7 +83,7 @@ def main() -> None:
     """Compile until there is a kernel that another process has compiled."""
     for name in _ORDER:
         module, _, function = name.rpartition(".")
-        if module in (_OTHERS if available() else _DOTS):
+        if module in (_OTHERS if has("avx512bf16") else _DOTS):
             continue
         kernel = getattr(importlib.import_module(f"gridreg.ops.{module}"), function)
         if kernel.cached:

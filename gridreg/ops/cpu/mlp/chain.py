@@ -47,13 +47,20 @@ def _part(x: Tensor, part: slice) -> Tensor:
     return F.pad(x[part], (0, 0, 0, missing)) if missing else x[part]
 
 
+def _onednn_takes(dtype: torch.dtype) -> bool:
+    if not torch._C._has_mkldnn:
+        return False
+    return dtype == torch.float32 or bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())
+
+
 def product(x: Tensor, weight: Tensor, bias: Tensor | None, relu: bool) -> Tensor:
     """``x weight^T + bias``, then ReLU if wanted.
 
-    By oneDNN if it can be had: MKL takes twice as long for results whose rows are not a multiple of 16 wide.
+    By oneDNN if it can be had: MKL takes twice as long for results whose rows are not a multiple of 16 wide. In
+    bfloat16 oneDNN refuses processors without AVX-512, where torch's own product serves.
     """
     fused = getattr(torch.ops.mkldnn, "_linear_pointwise", None)
-    if fused is not None and torch._C._has_mkldnn and x.numel() and weight.numel():
+    if fused is not None and _onednn_takes(x.dtype) and x.numel() and weight.numel():
         found: Tensor = fused(x, weight, bias, "relu" if relu else "none", [], "")
         return found
     found = F.linear(x, weight, bias)
