@@ -23,7 +23,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from mesh_pictures import mesh_picture
 from stored_command import stored_command
 
-from gridreg.cli import ending
+from gridreg.cli import run_cli
 from gridreg.export import (
     Camera,
     Lens,
@@ -38,7 +38,7 @@ from gridreg.export import (
 from gridreg.export.pictures import picture
 from gridreg.training import TrainOptions, configure, execute, open_scene
 from gridreg.training.files import check_output_folder, write_json
-from gridreg.training.pictures import labelled, row, save_png
+from gridreg.training.images import labelled, row, save_png
 
 RESULTS = Path(__file__).parent / "results" / "bodies"
 TRUTH = "mesh_gt.ply"
@@ -185,4 +185,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(ending(main))
+    sys.exit(run_cli(main))

@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 
 from gridreg.ablation import Store
-from gridreg.cli import ending
+from gridreg.cli import run_cli
 from gridreg.training.files import write_json
 
 RESULTS = Path(__file__).parent / "results"
@@ -68,4 +68,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(ending(main))
+    sys.exit(run_cli(main))

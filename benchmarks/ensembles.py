@@ -22,7 +22,7 @@ import torch
 sys.path.insert(0, str(Path(__file__).parent))
 from error_pictures import kept
 
-from gridreg.cli import ending
+from gridreg.cli import run_cli
 from gridreg.errors import InputError
 from gridreg.scenes import Scene, load_scene
 from gridreg.training import LoadedRun, load_run
@@ -134,4 +134,4 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(ending(main))
+    sys.exit(run_cli(main))

@@ -21,12 +21,12 @@ import torch
 sys.path.insert(0, str(Path(__file__).parent))
 from quality import result_path
 
-from gridreg.cli import ending
+from gridreg.cli import run_cli
 from gridreg.errors import InputError
 from gridreg.scenes import load_scene
 from gridreg.training.files import check_output_folder
+from gridreg.training.images import labelled, row, save_png, scale_bar, thumbnail, to_uint8
 from gridreg.training.outputs import MAX_ERROR, error_map
-from gridreg.training.pictures import labelled, row, save_png, scale_bar, thumbnail, to_picture
 
 LEAST = 64
 """Pixels that the scale of the error takes."""
@@ -57,12 +57,12 @@ def median_view(values: dict[str, float]) -> str:
 
 def compose(target: torch.Tensor, renders: dict[str, tuple[torch.Tensor, float]], size: int) -> np.ndarray:
     """Target and renders above, the error's scale and the error maps below; images ``(H, W, 3)`` in [0, 1]."""
-    upper = [labelled(thumbnail(to_picture(target), size), "target")]
-    lower = [np.full_like(labelled(thumbnail(to_picture(target), size), " "), 255)]
+    upper = [labelled(thumbnail(to_uint8(target), size), "target")]
+    lower = [np.full_like(labelled(thumbnail(to_uint8(target), size), " "), 255)]
     bar = scale_bar(lower[0].shape[0], 0.0, MAX_ERROR)
     lower[0][:, -bar.shape[1] :] = bar
     for name, (image, value) in renders.items():
-        upper.append(labelled(thumbnail(to_picture(image), size), f"{name}  {value:.2f} dB"))
+        upper.append(labelled(thumbnail(to_uint8(image), size), f"{name}  {value:.2f} dB"))
         lower.append(labelled(thumbnail(error_map(image, target), size), "error (RMS of channels)"))
     return np.concatenate([row(upper), row(lower)])
 
@@ -111,4 +111,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(ending(main))
+    sys.exit(run_cli(main))

@@ -23,7 +23,7 @@ from speed.ball import BallStep, as_contestants, ball_field, ball_rays
 from speed.common import at_least, in_turns, medians, ratios
 
 import gridreg
-from gridreg.cli import ending
+from gridreg.cli import run_cli
 from gridreg.training.files import check_output_folder, write_json
 from gridreg.training.versions import versions
 
@@ -90,4 +90,4 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(ending(main))
+    sys.exit(run_cli(main))

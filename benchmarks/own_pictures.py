@@ -27,7 +27,7 @@ from PIL import ExifTags, Image
 sys.path.insert(0, str(Path(__file__).parent))
 from stored_command import stored_command
 
-from gridreg.cli import ending
+from gridreg.cli import run_cli
 from gridreg.scenes import load_scene, prepare
 from gridreg.scenes.builtin.cameras import FIELD_OF_VIEW, RADIUS, look_at_origin
 from gridreg.scenes.builtin.raycast import render_rgba
@@ -202,4 +202,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(ending(main))
+    sys.exit(run_cli(main))

@@ -21,7 +21,7 @@ import torch
 sys.path.insert(0, str(Path(__file__).parent))
 from speed.whole_run import Spans
 
-from gridreg.cli import ending
+from gridreg.cli import run_cli
 from gridreg.ops.rays import use_backend
 from gridreg.training import StepReport, configure, execute, open_scene
 from gridreg.training.checkpoint import has_checkpoint
@@ -181,4 +181,4 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(ending(main))
+    sys.exit(run_cli(main))

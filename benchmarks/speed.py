@@ -16,7 +16,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parent))
 from speed.main import main
 
-from gridreg.cli import ending
+from gridreg.cli import run_cli
 
 if __name__ == "__main__":
-    sys.exit(ending(main))
+    sys.exit(run_cli(main))

@@ -10,7 +10,7 @@ import sys
 import tyro
 
 from gridreg.ablation.command import AblationOptions, run
-from gridreg.cli.ending import ending
+from gridreg.cli.exit_status import run_cli
 
 if __name__ == "__main__":
-    sys.exit(ending(lambda: run(tyro.cli(AblationOptions))))
+    sys.exit(run_cli(lambda: run(tyro.cli(AblationOptions))))

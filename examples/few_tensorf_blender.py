@@ -11,7 +11,7 @@ from pathlib import Path
 
 import tyro
 
-from gridreg.cli import ending
+from gridreg.cli import run_cli
 from gridreg.export import check_drawing, draw_run, live_view
 from gridreg.training import TrainOptions, configure, execute, open_scene, output_folder
 from gridreg.training.record import summary
@@ -39,4 +39,4 @@ def main(options: TrainOptions) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(ending(lambda: main(tyro.cli(TrainOptions))))
+    sys.exit(run_cli(lambda: main(tyro.cli(TrainOptions))))

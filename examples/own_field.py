@@ -1,4 +1,4 @@
-"""A voxel field of one's own, with and without gridreg: one call of `apply`, four pictures, half a minute.
+"""A voxel field of one's own, with and without gridreg: one call of `apply`, four photographs, half a minute.
 
 Run it with `python examples/own_field.py`. It writes `own_field.png`: two views that were not trained on, from
 left to right the truth, the bare field, and the same field with regularizers.
@@ -37,7 +37,7 @@ class VoxelField(nn.Module):
 
 
 def regularizers() -> list[gridreg.Regularizer]:
-    """What this page is about: everything that few pictures need, attached from the outside."""
+    """What this page is about: everything that few photographs need, attached from the outside."""
     density, features = gridreg.parameters("density", dim=1), gridreg.parameters("features", dim=1)
     return [
         gridreg.FrequencyMask(features, until=0.5),
@@ -93,7 +93,7 @@ def render(
 
 
 def train(composition: list[gridreg.Regularizer], steps: int, seed: int) -> VoxelField:
-    """A field trained on four pictures, with a composition attached while it learns."""
+    """A field trained on four photographs, with a composition attached while it learns."""
     torch.manual_seed(seed)
     field = VoxelField()
     views = [rays(90 * i, 20 + 20 * (i % 2)) for i in range(4)]
@@ -116,7 +116,7 @@ def train(composition: list[gridreg.Regularizer], steps: int, seed: int) -> Voxe
 
 @torch.no_grad()
 def main() -> None:
-    """Train twice, compare on views between those of the training, write the picture."""
+    """Train twice, compare on views between those of the training, write the image."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--steps", type=int, default=300)
     parser.add_argument("--seed", type=int, default=0)
@@ -135,8 +135,8 @@ def main() -> None:
             f"{name}: {-10 * torch.stack(errors).log10().mean():.2f} dB on {len(views)} views not trained on"
         )
     rows = [torch.cat([column[i].view(SIZE, SIZE, 3) for column in columns], 1) for i in (0, 2)]
-    picture = (255 * torch.cat(rows).clamp(0, 1)).byte().numpy().repeat(4, 0).repeat(4, 1)
-    imageio.imwrite(options.out, picture)
+    image = (255 * torch.cat(rows).clamp(0, 1)).byte().numpy().repeat(4, 0).repeat(4, 1)
+    imageio.imwrite(options.out, image)
     print(f"wrote {options.out}")
 
 

@@ -50,7 +50,7 @@ def test_the_paper_is_the_background(opaque, tmp_path, capfd):
     assert torch.equal(behind(trainer), scene.background.expand(64, 3))
     execute(CONFIG, scene, tmp_path / "run")
     said = "".join(capfd.readouterr())
-    assert "opaque pictures on one colour (0.80, 0.60, 0.40): it is the background" in said
+    assert "opaque photographs on one colour (0.80, 0.60, 0.40): it is the background" in said
     given = load_scene(opaque, "holdout8", background="black")
     assert given.background.tolist() == [0, 0, 0]
 

@@ -10,10 +10,10 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 
-from gridreg.cli import ending
+from gridreg.cli import run_cli
 from gridreg.scenes import builtin_scene, load_scene
+from gridreg.training.images import save_png, to_uint8
 from gridreg.training.outputs import error_map
-from gridreg.training.pictures import save_png, to_picture
 from tests.programs import ROOT, module_at
 
 
@@ -35,7 +35,7 @@ def kept(tmp_path_factory):
         for place, name in enumerate(scene.test.names):
             rgba = scene.test.rgba[place]
             target = rgba[..., :3] * rgba[..., 3:] + (1 - rgba[..., 3:]) * scene.background
-            save_png(test / f"{name}.png", to_picture(factor * target))
+            save_png(test / f"{name}.png", to_uint8(factor * target))
             images[name] = {"psnr": float(place)}
         (test.parent / "metrics.json").write_text(json.dumps({"images": images}))
     return path, folder, scene
@@ -55,7 +55,7 @@ def call(program, monkeypatch, path: Path, folder: Path, into: Path, *more: str)
     monkeypatch.setattr(
         sys, "argv", ["error_pictures.py", *words, "--into", str(into), "--size", "96", *more]
     )
-    return ending(program.main)
+    return run_cli(program.main)
 
 
 def test_the_median_view_with_its_target_renders_and_errors(program, kept, monkeypatch, tmp_path, capsys):

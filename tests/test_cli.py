@@ -20,7 +20,7 @@ import pytest
 import torch
 from PIL import Image
 
-from gridreg.cli import COMMANDS, ending, main
+from gridreg.cli import COMMANDS, main, run_cli
 from gridreg.cli.main import options_of, overview
 from gridreg.errors import InputError
 from gridreg.export import read_mesh
@@ -161,14 +161,14 @@ def raising(error: BaseException) -> int:
     raise error
 
 
-def test_ending_of_bad_input_and_of_interruption(capsys: pytest.CaptureFixture[str]) -> None:
-    assert ending(lambda: 3) == 3
-    assert ending(lambda: raising(InputError("scene: found none"))) == 2
+def test_exit_status_of_bad_input_and_of_interruption(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_cli(lambda: 3) == 3
+    assert run_cli(lambda: raising(InputError("scene: found none"))) == 2
     assert capsys.readouterr().err == "error: scene: found none\n"
-    assert ending(lambda: raising(KeyboardInterrupt())) == 130
+    assert run_cli(lambda: raising(KeyboardInterrupt())) == 130
     assert capsys.readouterr().err == "stopped\n"
     with pytest.raises(ValueError, match="a defect"):
-        ending(lambda: raising(ValueError("a defect")))
+        run_cli(lambda: raising(ValueError("a defect")))
 
 
 def test_a_reader_that_has_seen_enough() -> None:

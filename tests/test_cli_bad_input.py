@@ -289,7 +289,7 @@ def test_another_scene(refused: Refused, tmp_path: Path, empty_run: Path, scene:
     Image.new("RGBA", (24, 24), (9, 9, 9, 255)).save(first)
     line = refused("eval", str(empty_run), "--scene", "scene")
     assert "trained on another scene" in line
-    assert "expected the same training pictures" in line
+    assert "expected the same training images" in line
 
 
 # --- meshes, films, ports

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from gridreg.errors import InputError
-from gridreg.export import LiveView, draw_run, film_path, live_view, model_of_run, model_of_trainer
+from gridreg.export import LiveView, draw_run, live_view, model_of_run, model_of_trainer, video_path
 from gridreg.export.cameras import Camera, Lens
 from gridreg.scenes import Scene, builtin_scene, load_scene
 from gridreg.training import Execution, RunConfig, build_trainer, execute, load_run
@@ -64,21 +64,21 @@ def test_a_loaded_run_looks_like_the_trained_one(scene: Scene, tmp_path: Path) -
 
 def test_film_paths(scene: Scene, forward: Scene) -> None:
     model = model_of_trainer(build_trainer(CONFIG, scene))
-    assert len(film_path(model, None, frames=3)) == 3
-    turn = film_path(model, scene.train, frames=4, width=8)
+    assert len(video_path(model, None, frames=3)) == 3
+    turn = video_path(model, scene.train, frames=4, width=8)
     assert {camera.lens.width for camera in turn} == {8}
     # Once around: opposite cameras look in opposite directions across the vertical axis.
     assert float(turn[0].pose[:2, 2] @ turn[2].pose[:2, 2]) < 0
 
     facing = model_of_trainer(build_trainer(CONFIG, forward))
     assert facing.warp == warp_of(forward)
-    sway = film_path(facing, forward.train, frames=5)
+    sway = video_path(facing, forward.train, frames=5)
     assert all(float(camera.pose[2, 2]) > 0.9 for camera in sway)
-    assert len(film_path(facing, forward.train, "train", frames=2)) == 2
+    assert len(video_path(facing, forward.train, "train", frames=2)) == 2
     with pytest.raises(InputError, match="a forward-facing scene has no back"):
-        film_path(facing, forward.train, "turntable")
+        video_path(facing, forward.train, "turntable")
     with pytest.raises(InputError, match="needs the training cameras"):
-        film_path(facing)
+        video_path(facing)
 
 
 def test_what_is_drawn_of_a_run(

@@ -21,7 +21,7 @@ from gridreg.export.pictures import colour_bar, depth_range, picture
 from gridreg.export.video import render_frames, render_video
 from gridreg.export.writers import write_video
 from gridreg.rendering import Rays, Rendered
-from gridreg.training.pictures import row
+from gridreg.training.images import row
 from tests.export_fields import AnalyticField, ball, ring_of_views
 
 RED = torch.tensor([1.0, 0.0, 0.0])

@@ -13,7 +13,10 @@ BEFORE: dict[str, list[str]] = json.loads(
     (Path(__file__).parent / "data" / "inventory-0.1.0.json").read_text(encoding="utf-8")
 )
 #: Old name: new name, by kind. Tests beside the code show that the old one is refused and the new one named.
-RENAMED: dict[str, dict[str, str]] = {}
+RENAMED: dict[str, dict[str, str]] = {
+    # A positional argument, whose name is only shown.
+    "options": {"prepare.pictures": "prepare.images"},
+}
 
 
 @pytest.mark.parametrize("kind", BEFORE)

@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from gridreg.errors import InputError
-from gridreg.training import outputs, pictures
+from gridreg.training import images as image_arrays
+from gridreg.training import outputs
 
 
 def inferno(share: np.ndarray) -> np.ndarray:
@@ -27,11 +28,11 @@ def pair() -> tuple[Tensor, Tensor]:
     return (target + 0.2 * torch.rand(30, 40, 3, generator=generator)).clamp(0, 1), target
 
 
-def test_to_picture_rounds_and_clamps():
+def test_to_uint8_rounds_and_clamps():
     image = torch.tensor([[[-1.0, 0.0, 0.499 / 255], [0.501 / 255, 2.0, math.nan]]])
-    assert pictures.to_picture(image).tolist() == [[[0, 0, 0], [1, 255, 0]]]
+    assert image_arrays.to_uint8(image).tolist() == [[[0, 0, 0], [1, 255, 0]]]
     with pytest.raises(InputError, match=r"expected \(H, W, 3\)"):
-        pictures.to_picture(torch.zeros(3, 4))
+        image_arrays.to_uint8(torch.zeros(3, 4))
 
 
 def test_error_map_is_the_rms_over_channels(pair):
@@ -55,8 +56,8 @@ def test_comparison_holds_target_render_and_error_in_this_order():
     image, target = torch.rand(2, 220, 210, 3, generator=generator)
     picture = outputs.comparison(image, target, metrics={"psnr": 20.123, "ssim_gaussian": 0.5})
     body = picture[-220:]
-    assert np.array_equal(body[:, :210], pictures.to_picture(target))
-    assert np.array_equal(body[:, 214:424], pictures.to_picture(image))
+    assert np.array_equal(body[:, :210], image_arrays.to_uint8(target))
+    assert np.array_equal(body[:, 214:424], image_arrays.to_uint8(image))
     assert np.array_equal(body[:, 428:638], outputs.error_map(image, target))
     assert picture.shape[1] > 638 + 40
     strip = picture[:-220]
@@ -68,20 +69,20 @@ def test_small_images_are_enlarged_by_whole_pixels(pair):
     image, target = pair
     picture = outputs.comparison(image, target)
     body = picture[-150:]
-    assert np.array_equal(body[:, :200], pictures.to_picture(target).repeat(5, 0).repeat(5, 1))
+    assert np.array_equal(body[:, :200], image_arrays.to_uint8(target).repeat(5, 0).repeat(5, 1))
 
 
 def test_labels_are_cut_and_not_wrapped():
     picture = np.zeros((5, 30, 3), np.uint8)
-    got = pictures.labelled(picture, "a label that is much wider than thirty pixels")
+    got = image_arrays.labelled(picture, "a label that is much wider than thirty pixels")
     assert got.shape[1:] == (30, 3)
     assert np.array_equal(got[-5:], picture)
 
 
 @pytest.mark.parametrize("height", [2, 5, 20, 100, 400])
 def test_scale_bar_goes_from_low_below_to_high_above(height):
-    bar = pictures.scale_bar(height, 0.0, 2.0)
-    assert bar.shape == pictures.scale_bar(height, 0.0, 2.0, unit="depth").shape == (height, 64, 3)
+    bar = image_arrays.scale_bar(height, 0.0, 2.0)
+    assert bar.shape == image_arrays.scale_bar(height, 0.0, 2.0, unit="depth").shape == (height, 64, 3)
     ramp = bar[:, 10].astype(int)
     coloured = ramp[(ramp != 255).any(-1)]
     assert len(coloured) >= 2
@@ -89,28 +90,28 @@ def test_scale_bar_goes_from_low_below_to_high_above(height):
 
 
 def test_the_unit_stands_above_the_scale():
-    with_unit, without = (pictures.scale_bar(200, 0.0, 1.0, unit=unit)[:16] for unit in ("depth", ""))
+    with_unit, without = (image_arrays.scale_bar(200, 0.0, 1.0, unit=unit)[:16] for unit in ("depth", ""))
     assert (with_unit < 128).any()
     assert (without[:, :20][:8] == 255).all()
 
 
 def test_rows_and_thumbnails():
     low, high = np.zeros((2, 3, 3), np.uint8), np.full((4, 1, 3), 7, np.uint8)
-    got = pictures.row([low, high], gap=2)
+    got = image_arrays.row([low, high], gap=2)
     assert got.shape == (4, 6, 3)
     assert (got[:2, :3] == 0).all()
     assert (got[2:, :3] == 255).all()
     assert (got[:, 3:5] == 255).all()
     assert (got[:, 5] == 7).all()
-    assert pictures.thumbnail(np.zeros((100, 50, 3), np.uint8), 10).shape == (10, 5, 3)
-    assert pictures.thumbnail(np.zeros((1, 1000, 3), np.uint8), 10).shape == (1, 10, 3)
+    assert image_arrays.thumbnail(np.zeros((100, 50, 3), np.uint8), 10).shape == (10, 5, 3)
+    assert image_arrays.thumbnail(np.zeros((1, 1000, 3), np.uint8), 10).shape == (1, 10, 3)
 
 
 def test_depth_is_the_mean_distance_near_is_bright_and_nothing_is_white():
     distance = torch.linspace(2, 6, 300)[None, :].expand(240, 300)
     opacity = torch.full((240, 300), 0.8)
     opacity[:120] = 0
-    picture = outputs.depth_picture(distance * opacity, opacity)[:, :300].astype(int)
+    picture = outputs.depth_image(distance * opacity, opacity)[:, :300].astype(int)
     assert (picture[:120] == 255).all()
     brightness = picture[200].sum(-1)
     assert brightness[5] > brightness[150] > brightness[294]
@@ -123,7 +124,7 @@ def test_depth_is_the_mean_distance_near_is_bright_and_nothing_is_white():
 @pytest.mark.parametrize("opacity", [0.0, 1.0, math.nan])
 def test_depth_of_nothing_and_of_a_flat_wall(opacity):
     opacities = torch.full((20, 20), opacity)
-    picture = outputs.depth_picture(3 * opacities, opacities)
+    picture = outputs.depth_image(3 * opacities, opacities)
     assert picture.shape[0] == 200
     white = (picture[:, :200] == 255).all()
     assert white == (opacity != 1.0)
@@ -134,14 +135,14 @@ def test_save_view_writes_three_pictures(tmp_path, pair):
     depth = torch.ones(30, 40)
     outputs.save_view(tmp_path, "r_0", image, target, depth=depth, opacity=depth, metrics={"psnr": math.inf})
     assert sorted(p.name for p in tmp_path.iterdir()) == ["r_0.png", "r_0_compare.png", "r_0_depth.png"]
-    assert np.array_equal(iio.imread(tmp_path / "r_0.png"), pictures.to_picture(image))
+    assert np.array_equal(iio.imread(tmp_path / "r_0.png"), image_arrays.to_uint8(image))
     assert np.array_equal(iio.imread(tmp_path / "r_0_compare.png")[-150:, :200], picture_of(target))
     outputs.save_view(tmp_path, "r_8", image, target)
     assert not (tmp_path / "r_8_depth.png").exists()
 
 
 def picture_of(image: Tensor) -> np.ndarray:
-    return pictures.to_picture(image).repeat(5, 0).repeat(5, 1)
+    return image_arrays.to_uint8(image).repeat(5, 0).repeat(5, 1)
 
 
 @pytest.mark.parametrize("count", [1, 4, 7])
@@ -155,8 +156,8 @@ def test_contact_sheet_holds_every_pair(tmp_path, count):
     for index in range(count):
         line, column = divmod(index, 3)
         y, x = line * (40 + 20 + 8) + 20 + 20, column * (81 + 8) + 20
-        assert (sheet[y, x] == pictures.to_picture(targets[index])[0, 0]).all()
-        assert (sheet[y, x + 41] == pictures.to_picture(images[index])[0, 0]).all()
+        assert (sheet[y, x] == image_arrays.to_uint8(targets[index])[0, 0]).all()
+        assert (sheet[y, x + 41] == image_arrays.to_uint8(images[index])[0, 0]).all()
 
 
 @pytest.mark.parametrize("names", [[], ["a", "b"]])
@@ -170,7 +171,7 @@ def test_shapes_that_do_not_fit(pair):
     with pytest.raises(InputError, match="expected equal shapes"):
         outputs.comparison(image[:-1], target)
     with pytest.raises(InputError, match=r"expected \(H, W\) both"):
-        outputs.depth_picture(torch.zeros(3, 3), torch.zeros(3, 4))
+        outputs.depth_image(torch.zeros(3, 3), torch.zeros(3, 4))
 
 
 def test_an_unwritable_place_is_one_line(tmp_path, pair):

@@ -13,7 +13,7 @@ from PIL import Image
 
 from gridreg.ablation.curves import Histories
 from gridreg.ablation.records import RunResult
-from gridreg.training.pictures import Picture, coloured
+from gridreg.training.images import ImageArray, coloured
 
 __all__ = ["mask_schedules"]
 
@@ -71,7 +71,7 @@ def _mask_picture(site: str, steps: Sequence[int], rows: Sequence[Sequence[float
     )
 
 
-def _data_uri(picture: Picture) -> str:
+def _data_uri(picture: ImageArray) -> str:
     buffer = io.BytesIO()
     Image.fromarray(picture).save(buffer, format="PNG", optimize=True)
     return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()

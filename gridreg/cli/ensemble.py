@@ -24,7 +24,7 @@ class EnsembleOptions:
         tyro.conf.Positional,
         tyro.conf.arg(metavar="RUN RUN [RUN ...]", help_behavior_hint=""),
     ]
-    """Output folders of runs, or their checkpoints, trained on the same pictures."""
+    """Output folders of runs, or their checkpoints, trained on the same images."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
     """Folder for the ensemble; one that holds a run is refused."""
 

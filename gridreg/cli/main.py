@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from importlib import metadata
 from typing import Annotated, Any, Union
 
-from gridreg.cli.ending import ending
+from gridreg.cli.exit_status import run_cli
 from gridreg.errors import InputError
 
 __all__ = ["COMMANDS", "Command", "main", "options_of"]
@@ -39,16 +39,16 @@ def _own(about: str, module: str, options: str) -> Command:
 
 
 COMMANDS: dict[str, Command] = {
-    "prepare": _own("turn a folder of pictures into a scene", "prepare", "PrepareOptions"),
+    "prepare": _own("turn a folder of images into a scene", "prepare", "PrepareOptions"),
     "train": Command(
-        "reconstruct a scene, score it, and write a mesh and a film",
+        "reconstruct a scene, score it, and write a mesh and a video",
         "gridreg.training.options:TrainOptions",
         "gridreg.cli.train:run",
     ),
     "eval": _own("score a checkpoint again", "evaluate", "EvalOptions"),
     "ensemble": _own("make one run of several: the mean of their fields", "ensemble", "EnsembleOptions"),
     "view": _own("look at a checkpoint in the browser", "view", "ViewOptions"),
-    "render": _own("film one checkpoint, or several side by side", "render", "RenderOptions"),
+    "render": _own("render a video of one checkpoint, or of several side by side", "render", "RenderOptions"),
     "mesh": _own("cut a mesh out of a checkpoint", "mesh", "MeshOptions"),
     "compare-mesh": _own("measure a mesh against the true one", "compare_mesh", "CompareMeshOptions"),
     "ablate": Command(
@@ -70,7 +70,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: the words after the program's name; None: those of this process.
     """
     words = list(sys.argv[1:] if argv is None else argv)
-    return ending(lambda: _main(words))
+    return run_cli(lambda: _main(words))
 
 
 def _main(words: list[str]) -> int:
@@ -109,7 +109,7 @@ def overview() -> str:
         [
             "usage: gridreg COMMAND [OPTIONS]",
             "",
-            "From a few pictures to a radiance field, a mesh, a film, and an honest score.",
+            "From a few photographs to a radiance field, a mesh, a video, and an honest score.",
             "",
             *lines,
             "",
@@ -117,8 +117,8 @@ def overview() -> str:
             "gridreg --version",
             "gridreg --tyro-print-completion bash|zsh    completion for a shell, to be sourced",
             "",
-            "From pictures of your own:",
-            "  gridreg prepare PICTURES SCENE",
+            "From images of your own:",
+            "  gridreg prepare IMAGES SCENE",
             "  gridreg train --scene SCENE --out RUN --view",
             "  gridreg view RUN",
         ]

@@ -1,4 +1,4 @@
-"""``gridreg prepare``: pictures in, a scene out."""
+"""``gridreg prepare``: images in, a scene out."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ Box = Annotated[
 
 @dataclass
 class PrepareOptions:
-    """Turn a folder of pictures (extra `colmap`), or a scene of COLMAP, nerfstudio or instant-ngp, into a scene folder.
+    """Turn a folder of images (extra `colmap`), or a scene of COLMAP, nerfstudio or instant-ngp, into a scene folder.
 
     The world is turned so that z is up, centred, and scaled so that the box reaches 1.3 to each side. Look at
     cameras.png before training; give near, far and box anew where it shows them wrong.
     """
 
-    pictures: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PICTURES")]
-    """Folder of pictures (.jpg, .png, all of one size), or of a scene with cameras."""
+    images: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="IMAGES")]
+    """Folder of images (.jpg, .png, all of one size), or of a scene with cameras."""
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
     """Scene folder to make; must not exist."""
     masks: OptionalFolder = None
-    """Folder with a mask for every picture, white where it is kept, called like the picture with .png."""
+    """Folder with a mask for every image, white where it is kept, called like the image with .png."""
     near: OptionalFloat = None
     """Distance from a camera where looking begins, world units of the made scene; default: from cameras and points."""
     far: OptionalFloat = None
     """Distance from a camera where looking ends, likewise."""
     longest_edge: int = 800
-    """Pixels; larger pictures are reduced to this once their cameras are known."""
+    """Pixels; larger images are reduced to this once their cameras are known."""
     box: Box = None
     """Lower and upper corner, world units of the made scene; default: from cameras and points."""
 
@@ -58,7 +58,7 @@ def run(options: PrepareOptions) -> int:
         print(f"{stage} ...", file=sys.stderr, flush=True)
 
     made = prepare(
-        options.pictures,
+        options.images,
         options.out,
         masks=options.masks,
         near=options.near,

@@ -1,4 +1,4 @@
-"""``gridreg render``: films of checkpoints."""
+"""``gridreg render``: videos of checkpoints."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["RenderOptions", "run"]
 
 @dataclass
 class RenderOptions:
-    """Film a checkpoint along a path of cameras; several checkpoints lie side by side in one film."""
+    """Render a video of a checkpoint along a path of cameras; several checkpoints lie side by side in one video."""
 
     checkpoints: Annotated[
         tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN [RUN ...]", help_behavior_hint="")
@@ -29,11 +29,11 @@ class RenderOptions:
     modes: tuple[Literal["rgb", "depth", "opacity"], ...] = ("rgb",)
     """What to show, side by side; depth has a scale in world units."""
     frames: int = 120
-    """Number of pictures; a camera file has its own."""
+    """Number of images; a camera file has its own."""
     fps: float = 30.0
-    """Pictures per second."""
+    """Images per second."""
     width: OptionalInt = None
-    """Of each picture, pixels; default: that of the training pictures."""
+    """Of each image, pixels; default: that of the training images."""
     elevation: OptionalFloat = None
     """Of the turntable, degrees above the horizon; default: the median of the training cameras'."""
     radius: OptionalFloat = None
@@ -43,14 +43,14 @@ class RenderOptions:
 
 
 def run(options: RenderOptions) -> int:
-    """Write the film and say where.
+    """Write the video and say where.
 
     Raises:
         InputError: for missing or damaged checkpoints, bad paths and numbers, or without ffmpeg (MP4).
     """
     from gridreg.cli.runs import folder_of, views_scene
     from gridreg.errors import InputError
-    from gridreg.export import film_path, model_of_run, render_video
+    from gridreg.export import model_of_run, render_video, video_path
     from gridreg.training import load_run
     from gridreg.training.progress import Progress
 
@@ -64,7 +64,7 @@ def run(options: RenderOptions) -> int:
     if scene is None:
         print(f"{runs[0].config.scene}: not there any more, so the path follows the box", file=sys.stderr)
     models = [model_of_run(run) for run in runs]
-    cameras = film_path(
+    cameras = video_path(
         models[0],
         None if scene is None else scene.train,
         options.path,

@@ -39,7 +39,7 @@ def scene_of(run: LoadedRun, checkpoint: Path, scene: Path | None, *, test: bool
     if found.fingerprint != run.fingerprint:
         raise InputError(
             f"{checkpoint}: trained on another scene than {config.scene or 'the built-in one'} under {found.protocol} "
-            f"(fingerprint {run.fingerprint[:12]}, found {found.fingerprint[:12]}); expected the same training pictures"
+            f"(fingerprint {run.fingerprint[:12]}, found {found.fingerprint[:12]}); expected the same training images"
         )
     return found
 

@@ -23,7 +23,7 @@ class ViewOptions:
     port: int = 8080
     """Port to listen on; 0: any free one."""
     size: int = 512
-    """Longer edge of the picture at rest, pixels."""
+    """Longer edge of the image at rest, pixels."""
 
 
 def run(options: ViewOptions) -> int:

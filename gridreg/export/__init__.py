@@ -11,10 +11,10 @@ from gridreg.export.runs import (
     LiveView,
     check_drawing,
     draw_run,
-    film_path,
     live_view,
     model_of_run,
     model_of_trainer,
+    video_path,
 )
 from gridreg.export.video import render_frames, render_video
 from gridreg.export.viewer import Viewer
@@ -35,7 +35,7 @@ __all__ = [
     "compare_meshes",
     "draw_run",
     "extract_mesh",
-    "film_path",
+    "video_path",
     "live_view",
     "load_cameras",
     "look_at",

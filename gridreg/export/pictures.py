@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from gridreg.errors import InputError
 from gridreg.rendering import Rendered
-from gridreg.training.pictures import (
-    Picture,
+from gridreg.training.images import (
+    ImageArray,
     coloured,
     depth_limits,
     fading_into_white,
     scale_bar,
-    to_picture,
+    to_uint8,
 )
 
 __all__ = ["MODES", "DepthRange", "check_mode", "colour_bar", "depth_range", "picture", "z_depth"]
@@ -53,7 +53,7 @@ def depth_range(renders: Sequence[Rendered]) -> DepthRange:
     return depth_limits(torch.cat([d.reshape(-1) for d in depths]) if depths else torch.zeros(0))
 
 
-def picture(rendered: Rendered, mode: str, depths: DepthRange | None = None) -> Picture:
+def picture(rendered: Rendered, mode: str, depths: DepthRange | None = None) -> ImageArray:
     """One mode of a render as an image.
 
     Depth is the mean distance of what a pixel hits, from near (dark blue) to far (dark red), blended into
@@ -72,16 +72,16 @@ def picture(rendered: Rendered, mode: str, depths: DepthRange | None = None) -> 
     """
     check_mode(mode)
     if mode == "rgb":
-        return to_picture(rendered.colour)
+        return to_uint8(rendered.colour)
     if mode == "opacity":
-        return to_picture(rendered.opacity[..., None].expand(*rendered.opacity.shape, 3))
+        return to_uint8(rendered.opacity[..., None].expand(*rendered.opacity.shape, 3))
     near, far = depth_range([rendered]) if depths is None else depths
     mean = rendered.depth / rendered.opacity.clamp(min=_SEEN)
     colours = coloured(mean.detach().double().cpu().numpy(), near, far, _COLOURMAP)
     return fading_into_white(colours, rendered.opacity)
 
 
-def colour_bar(height: int, depths: DepthRange) -> Picture:
+def colour_bar(height: int, depths: DepthRange) -> ImageArray:
     """The scale of depth pictures ``(height, 64, 3)`` uint8: near below, far above, in world units."""
     return scale_bar(height, *depths, _COLOURMAP)
 

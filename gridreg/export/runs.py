@@ -26,7 +26,7 @@ __all__ = [
     "LiveView",
     "check_drawing",
     "draw_run",
-    "film_path",
+    "video_path",
     "live_view",
     "model_of_run",
     "model_of_trainer",
@@ -44,7 +44,7 @@ def model_of_trainer(trainer: Trainer) -> Model:
     return Model(trainer.field, trainer.occupancy, trainer.march, background, trainer.handle, trainer.warp)
 
 
-def film_path(
+def video_path(
     model: Model, views: Views | None = None, path: str | Path | None = None, **options: Any
 ) -> list[Camera]:
     """Cameras for a film of a model, as `camera_path` gives them.
@@ -111,7 +111,7 @@ def draw_run(run: Execution, *, mesh: bool = True, video: bool = True) -> list[P
             print(f"no mesh: {error}", file=sys.stderr)
     if video:
         target = run.out / ("spiral.mp4" if forward else "turntable.mp4")
-        render_video(model, target, film_path(model, run.scene.train, frames=60, width=200))
+        render_video(model, target, video_path(model, run.scene.train, frames=60, width=200))
         written.append(target)
     return written
 

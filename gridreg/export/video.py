@@ -14,7 +14,7 @@ from gridreg.export.model import Model
 from gridreg.export.pictures import DepthRange, check_mode, colour_bar, depth_range, picture
 from gridreg.export.writers import check_target, write_video
 from gridreg.rendering import Rendered
-from gridreg.training.pictures import Picture, row
+from gridreg.training.images import ImageArray, row
 
 __all__ = ["Progress", "render_frames", "render_video"]
 
@@ -59,7 +59,7 @@ def render_frames(
     *,
     modes: Sequence[str] = ("rgb",),
     depths: DepthRange | None = None,
-) -> Iterator[Picture]:
+) -> Iterator[ImageArray]:
     """The frames of `render_video`, ``(H, W, 3)`` uint8, one after the other.
 
     Raises:
@@ -82,7 +82,7 @@ def render_frames(
 
 def _frames(
     models: Sequence[Model], cameras: Sequence[Camera], modes: Sequence[str], depths: DepthRange | None
-) -> Iterator[Picture]:
+) -> Iterator[ImageArray]:
     for camera in cameras:
         parts = [picture(render, mode, depths) for render in _renders(models, camera) for mode in modes]
         if "depth" in modes and depths is not None:
@@ -102,7 +102,7 @@ def _film_depths(models: Sequence[Model], cameras: Sequence[Camera], looks: int 
     return depth_range([render for camera in small for render in _renders(models, camera)])
 
 
-def _reported(frames: Iterable[Picture], total: int, progress: Progress | None) -> Iterator[Picture]:
+def _reported(frames: Iterable[ImageArray], total: int, progress: Progress | None) -> Iterator[ImageArray]:
     start = time.monotonic()
     for done, frame in enumerate(frames, start=1):
         if progress is not None:

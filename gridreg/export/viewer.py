@@ -22,7 +22,7 @@ from gridreg.export.preview import Preview
 from gridreg.export.viewer_panel import Look, Panel
 from gridreg.rendering import Rendered
 from gridreg.scenes import Views
-from gridreg.training.pictures import Picture
+from gridreg.training.images import ImageArray
 
 __all__ = ["Viewer"]
 
@@ -276,7 +276,7 @@ class _Screen:
         self.moved = 0.0
 
 
-def _composed(rendered: Rendered, look: Look) -> tuple[Picture, str]:
+def _composed(rendered: Rendered, look: Look) -> tuple[ImageArray, str]:
     """The picture for the page, and what to say about it."""
     if look.mode != "depth":
         return picture(rendered, look.mode), ""

@@ -18,7 +18,7 @@ from PIL import Image
 
 from gridreg.errors import InputError
 from gridreg.training.files import check_output_folder, output_errors, writing
-from gridreg.training.pictures import Picture
+from gridreg.training.images import ImageArray
 
 __all__ = ["check_target", "find_ffmpeg", "write_video"]
 
@@ -56,7 +56,7 @@ def find_ffmpeg() -> str:
     return program
 
 
-def write_video(path: str | Path, frames: Iterable[Picture], fps: float = 30.0) -> None:
+def write_video(path: str | Path, frames: Iterable[ImageArray], fps: float = 30.0) -> None:
     """Write frames as they come to MP4, GIF or a folder of PNG files, by the suffix; whole or not at all.
 
     Args:
@@ -81,7 +81,7 @@ def write_video(path: str | Path, frames: Iterable[Picture], fps: float = 30.0) 
                 Image.fromarray(frame).save(folder / f"frame_{number:04d}.png")
 
 
-def _write_mp4(path: Path, frames: Iterable[Picture], fps: float) -> None:
+def _write_mp4(path: Path, frames: Iterable[ImageArray], fps: float) -> None:
     program = find_ffmpeg()
     process: subprocess.Popen[bytes] | None = None
     # Not a pipe: ffmpeg would stop when nobody empties it.
@@ -129,7 +129,7 @@ def _arguments(width: int, height: int, fps: float) -> list[str]:
     return ["-y", "-v", "error", *source, *target]
 
 
-def _write_gif(path: Path, frames: Iterable[Picture], fps: float) -> None:
+def _write_gif(path: Path, frames: Iterable[ImageArray], fps: float) -> None:
     images = (Image.fromarray(frame).quantize(256, dither=Image.Dither.NONE) for frame in frames)
     first = next(images, None)
     if first is None:

@@ -24,7 +24,7 @@ class WeightAverage:
         >>> for value in (1.0, 2.0, 6.0):
         ...     _ = weight.data.fill_(value)
         ...     average.add([weight])
-        >>> average.give([weight])
+        >>> average.copy_to([weight])
         >>> weight.item()
         3.0
     """
@@ -44,7 +44,7 @@ class WeightAverage:
             mean.lerp_(p, 1 / self.count)
 
     @torch.no_grad()
-    def give(self, parameters: Iterable[Tensor]) -> None:
+    def copy_to(self, parameters: Iterable[Tensor]) -> None:
         """Write the mean into the parameters, if there is one, and forget it."""
         if self.count:
             for mean, p in zip(self.means, parameters, strict=True):

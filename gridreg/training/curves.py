@@ -125,7 +125,7 @@ def draw_curves(
     Args:
         rows: as in ``History.rows``; may be empty.
         path: the PNG.
-        title: above the picture, such as scene and protocol.
+        title: above the image, such as scene and protocol.
         events: iterations to mark by a line, such as resamplings.
 
     Raises:
@@ -157,7 +157,7 @@ def draw_masks(rows: Sequence[Row], path: str | os.PathLike[str], *, title: str 
     Args:
         rows: as in ``History.rows``; those without masks are passed over.
         path: the PNG.
-        title: above the picture.
+        title: above the image.
 
     Raises:
         InputError: if no row has a mask, or the place is not writable.
@@ -172,15 +172,15 @@ def draw_masks(rows: Sequence[Row], path: str | os.PathLike[str], *, title: str 
         mask = np.full((len(known), max(len(row["masks"][site]) for row in known)), np.nan)
         for line, row in zip(mask, known, strict=True):
             line[: len(row["masks"][site])] = row["masks"][site]
-        # Each column of the picture reaches from one recorded step to the next.
+        # Each column of the image reaches from one recorded step to the next.
         steps = np.array([row["step"] for row in known], dtype=float)
         last = steps[-1] + (steps[-1] - steps[-2] if len(steps) > 1 else 1)
         edges = np.append(steps, last)
-        picture = axes.pcolormesh(edges, np.arange(mask.shape[1] + 1), mask.T, vmin=0, vmax=1, cmap="viridis")
+        image = axes.pcolormesh(edges, np.arange(mask.shape[1] + 1), mask.T, vmin=0, vmax=1, cmap="viridis")
         axes.set_ylabel(f"{_verbatim(site)}\nchannel", fontsize=8)
     all_axes[-1].set_xlabel("iteration")
     all_axes[0].set_title(_verbatim(title), fontsize=10)
-    figure.colorbar(picture, ax=list(all_axes), label="mask")
+    figure.colorbar(image, ax=list(all_axes), label="mask")
     with writing(path) as temporary:
         figure.savefig(temporary, dpi=110)
 

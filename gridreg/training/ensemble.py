@@ -45,7 +45,7 @@ def save_ensemble(folders: Sequence[str | Path], out: str | Path) -> int:
         if joined and fingerprint != first:
             raise InputError(
                 f"{folder}: trained on another scene than {folders[0]} (fingerprint {fingerprint[:12]}, expected "
-                f"{first[:12]}); expected the same training pictures"
+                f"{first[:12]}); expected the same training images"
             )
         first = fingerprint
         joined += parts

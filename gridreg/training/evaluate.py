@@ -42,7 +42,7 @@ def render_views(
     *,
     warp: Callable[[Rays], Rays] | None = None,
 ) -> Iterator[Rendered]:
-    """Pictures of a field from the cameras of views, one after the other."""
+    """Images of a field from the cameras of views, one after the other."""
     for pose, intrinsics in zip(views.poses, views.intrinsics, strict=True):
         yield render_image(
             field,
@@ -70,8 +70,8 @@ def score_views(
     """Render and score every view; ``each`` is told as soon as one is done."""
     scored = []
     targets = views.composited(background)
-    pictures = render_views(field, views, occupancy, march, background, warp=warp)
-    for name, rendered, target in zip(views.names, pictures, targets, strict=True):
+    images = render_views(field, views, occupancy, march, background, warp=warp)
+    for name, rendered, target in zip(views.names, images, targets, strict=True):
         one = Scored(name, rendered, target, image_metrics(rendered.colour, target))
         scored.append(one)
         if each is not None:
@@ -99,6 +99,6 @@ def mean_psnr_of(
         views.ids[chosen],
     )
     targets = some.composited(background)
-    pictures = render_views(field, some, occupancy, march, background, warp=warp)
-    values = [psnr(p.colour, t) for p, t in zip(pictures, targets, strict=True)]
+    images = render_views(field, some, occupancy, march, background, warp=warp)
+    values = [psnr(p.colour, t) for p, t in zip(images, targets, strict=True)]
     return float(torch.tensor(values, dtype=torch.float64).mean())

@@ -85,7 +85,7 @@ class Execution:
         if self.scene.train.backdrop is not None:
             colour = ", ".join(f"{c:.2f}" for c in self.scene.background.tolist())
             progress.message(
-                f"opaque pictures on one colour ({colour}): it is the background, never a random one"
+                f"opaque photographs on one colour ({colour}): it is the background, never a random one"
             )
 
         def each(report: StepReport) -> bool:

@@ -25,7 +25,7 @@ _Number = Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint=
 
 @dataclass
 class TrainOptions:
-    """Reconstruct a scene from a few pictures with known cameras, score it and save it."""
+    """Reconstruct a scene from a few photographs with known cameras, score it and save it."""
 
     scene: _Folder = None
     """Scene folder (Blender, transforms.json, COLMAP, LLFF); without one, the built-in scene."""

@@ -1,4 +1,4 @@
-"""Pictures that a scored run leaves: renders beside targets, error maps, depth."""
+"""Images that a scored run leaves: renders beside targets, error maps, depth."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from torch import Tensor
 
 from gridreg.errors import InputError
 from gridreg.training.evaluate import Scored
-from gridreg.training.pictures import (
-    Picture,
+from gridreg.training.images import (
+    ImageArray,
     coloured,
     depth_limits,
     fading_into_white,
@@ -23,12 +23,12 @@ from gridreg.training.pictures import (
     save_png,
     scale_bar,
     thumbnail,
-    to_picture,
+    to_uint8,
 )
 
 __all__ = [
     "comparison",
-    "depth_picture",
+    "depth_image",
     "error_map",
     "save_contact_sheet",
     "save_scored",
@@ -36,10 +36,10 @@ __all__ = [
 ]
 
 MAX_ERROR = 0.5
-"""Upper end of the error maps' scale; fixed, so that pictures of different runs compare."""
+"""Upper end of the error maps' scale; fixed, so that images of different runs compare."""
 
 
-def error_map(image: Tensor, target: Tensor, max_error: float = MAX_ERROR) -> Picture:
+def error_map(image: Tensor, target: Tensor, max_error: float = MAX_ERROR) -> ImageArray:
     """The error of each pixel, root mean square over the channels, as a colour from black to light yellow.
 
     Args:
@@ -55,7 +55,7 @@ def error_map(image: Tensor, target: Tensor, max_error: float = MAX_ERROR) -> Pi
 
 def comparison(
     image: Tensor, target: Tensor, *, metrics: Mapping[str, float] | None = None, max_error: float = MAX_ERROR
-) -> Picture:
+) -> ImageArray:
     """Target, render and error map side by side, with labels and the error's scale.
 
     Small images are enlarged by whole pixels, so that the labels are readable.
@@ -79,15 +79,15 @@ def comparison(
     error = thumbnail(error_map(image, target, max_error), size)
     return row(
         [
-            labelled(thumbnail(to_picture(target), size), "target"),
-            labelled(thumbnail(to_picture(image), size), label),
+            labelled(thumbnail(to_uint8(target), size), "target"),
+            labelled(thumbnail(to_uint8(image), size), label),
             labelled(error, "error (RMS of channels)"),
             labelled(scale_bar(error.shape[0], 0.0, max_error), ""),
         ]
     )
 
 
-def depth_picture(depth: Tensor, opacity: Tensor) -> Picture:
+def depth_image(depth: Tensor, opacity: Tensor) -> ImageArray:
     """The mean distance of what each pixel hits, bright is near, with its scale in world units.
 
     The scale reaches from the 1st to the 99th percentile of the pixels with an opacity over 0.5; the others
@@ -107,9 +107,9 @@ def depth_picture(depth: Tensor, opacity: Tensor) -> Picture:
     share = opacity.detach().double().nan_to_num(0).clamp(0, 1).cpu()
     distance = depth.detach().double().nan_to_num(0).cpu() / share.clamp(min=1e-6)
     near, far = depth_limits(distance[share > 0.5])
-    picture = fading_into_white(coloured(distance.numpy(), near, far, "viridis_r"), share)
+    image = fading_into_white(coloured(distance.numpy(), near, far, "viridis_r"), share)
     zoom = max(1, math.ceil(200 / max(share.shape)))
-    body = thumbnail(picture, zoom * max(share.shape))
+    body = thumbnail(image, zoom * max(share.shape))
     return row([body, scale_bar(body.shape[0], near, far, "viridis_r", "depth")])
 
 
@@ -130,7 +130,7 @@ def save_view(
         name: of the view, fit for a file name.
         image: the render, ``(H, W, 3)`` in [0, 1].
         target: the same shape, on the same background.
-        depth: ``(H, W)``, see ``depth_picture``; without it and ``opacity`` there is no depth picture.
+        depth: ``(H, W)``, see ``depth_image``; without it and ``opacity`` there is no depth image.
         opacity: ``(H, W)``.
         metrics: of this view, for the label.
 
@@ -138,10 +138,10 @@ def save_view(
         InputError: if the shapes do not fit, or the place is not writable.
     """
     place = Path(folder)
-    save_png(place / f"{name}.png", to_picture(image))
+    save_png(place / f"{name}.png", to_uint8(image))
     save_png(place / f"{name}_compare.png", comparison(image, target, metrics=metrics))
     if depth is not None and opacity is not None:
-        save_png(place / f"{name}_depth.png", depth_picture(depth, opacity))
+        save_png(place / f"{name}_depth.png", depth_image(depth, opacity))
 
 
 def save_scored(folder: str | os.PathLike[str], view: Scored) -> None:
@@ -150,14 +150,14 @@ def save_scored(folder: str | os.PathLike[str], view: Scored) -> None:
     Raises:
         InputError: if the place is not writable.
     """
-    picture = view.rendered
+    image = view.rendered
     save_view(
         folder,
         view.name,
-        picture.colour,
+        image.colour,
         view.target,
-        depth=picture.depth,
-        opacity=picture.opacity,
+        depth=image.depth,
+        opacity=image.opacity,
         metrics=view.metrics,
     )
 
@@ -181,7 +181,7 @@ def save_contact_sheet(
         targets: likewise.
         psnrs: of the views, dB.
         columns: pairs in a row.
-        size: longer side of a small picture, pixels.
+        size: longer side of a small image, pixels.
 
     Raises:
         InputError: if there is no view, the numbers differ, or the place is not writable.
@@ -192,13 +192,12 @@ def save_contact_sheet(
         )
     cells = []
     for index, (name, image, target) in enumerate(zip(names, images, targets, strict=True)):
-        pair = row([thumbnail(to_picture(target), size), thumbnail(to_picture(image), size)], gap=1)
+        pair = row([thumbnail(to_uint8(target), size), thumbnail(to_uint8(image), size)], gap=1)
         cells.append(labelled(pair, f"{name}  {psnrs[index]:.2f} dB" if psnrs is not None else name))
     rows = [row(cells[start : start + columns], gap=8) for start in range(0, len(cells), columns)]
-    width = max(picture.shape[1] for picture in rows)
+    width = max(image.shape[1] for image in rows)
     padded = [
-        np.pad(picture, ((0, 8), (0, width - picture.shape[1]), (0, 0)), constant_values=255)
-        for picture in rows
+        np.pad(image, ((0, 8), (0, width - image.shape[1]), (0, 0)), constant_values=255) for image in rows
     ]
     save_png(path, np.concatenate(padded))
 

@@ -14,7 +14,7 @@ __all__ = ["load_preset", "preset_names"]
 
 def _folder() -> Path:
     """Installed beside this file; in a checkout, ``examples/configs``, where a reader looks for them."""
-    installed = Path(__file__).parent / "presets"
+    installed = Path(__file__).parent / "configs"
     return installed if installed.is_dir() else Path(__file__).parents[2] / "examples" / "configs"
 
 

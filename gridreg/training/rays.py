@@ -22,7 +22,7 @@ class NdcWarp:
 
     Args:
         intrinsics: fx, fy, cx, cy in pixels of the average camera.
-        height, width: of its pictures, pixels.
+        height, width: of its images, pixels.
     """
 
     intrinsics: tuple[float, float, float, float]
@@ -56,7 +56,7 @@ class RayBank:
     """All pixels of the training views; rays are made for those that are drawn.
 
     Args:
-        views: ``V`` pictures of ``H x W``.
+        views: ``V`` images of ``H x W``.
         warp: maps their rays to the field's coordinates; None: these are the world's.
         reshuffle: draw every active pixel once before any is drawn again, instead of with replacement.
     """
@@ -85,7 +85,7 @@ class RayBank:
         """
         if not len(self.active):
             raise InputError(
-                f"training pictures: all of the {len(self.pixels)} pixels are transparent and see no occupied cell, "
+                f"training images: all of the {len(self.pixels)} pixels are transparent and see no occupied cell, "
                 "expected some to train on"
             )
         if self.reshuffle:

@@ -119,13 +119,13 @@ class Trainer:
             if self.step % _AVERAGED == 0:
                 self.average.add(self.field.parameters())
             if self.step == settings.steps:
-                self.average.give(self.field.parameters())
+                self.average.copy_to(self.field.parameters())
 
     def render_batch(self) -> tuple[Rendered, Tensor]:
         """Draw rays, render them, and composite the targets of the first ones on the same background ``(R, 3)``.
 
         Rays of unseen patches, where a regularizer needs them, come last and have no targets. The samples know the
-        opacity of their targets, but for these and for opaque pictures on a backdrop, which tell nothing of it.
+        opacity of their targets, but for these and for opaque photographs on a backdrop, which tell nothing of it.
         """
         settings = self.settings
         rays, rgba = self.bank.draw(settings.rays, self.generator)
@@ -139,7 +139,7 @@ class Trainer:
         jitter = torch.rand(len(rays), generator=self.generator)
         default = self.scene.background.to(rgba)
         background, opacity = None, rgba.new_full((len(rays),), math.nan)
-        # Behind opaque pictures on one colour, random ones would be answered with walls of that colour.
+        # Behind opaque photographs on one colour, random ones would be answered with walls of that colour.
         if self.scene.train.backdrop is None:
             background = self.handle.background(len(rays), self.generator, default)
             opacity[:seen] = rgba[:, 3]

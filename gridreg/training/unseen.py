@@ -1,4 +1,4 @@
-"""Patches of rays from cameras between the training cameras: no picture tells what these see."""
+"""Patches of rays from cameras between the training cameras: no image tells what these see."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def poses_between(first: Tensor, second: Tensor, share: Tensor, focus: Tensor) -
 class UnseenPatches:
     """Draws square patches of rays from cameras between two training cameras.
 
-    Such patches are what penalties on depth see of views without a picture. Source: RegNeRF (Niemeyer et al. 2022)
+    Such patches are what penalties on depth see of views without an image. Source: RegNeRF (Niemeyer et al. 2022)
     draws patches of 8x8 rays from unseen cameras, but places these in a box or on a sphere that it is told of.
 
     Args:
@@ -69,13 +69,13 @@ class UnseenPatches:
         warp: maps rays to the field's coordinates; None: these are the world's.
 
     Raises:
-        InputError: a patch is larger than the pictures.
+        InputError: a patch is larger than the images.
     """
 
     def __init__(self, views: Views, size: int, warp: NdcWarp | None = None) -> None:
         if size > min(views.height, views.width):
             raise InputError(
-                f"train.patch_size: found {size}, expected no more than the pictures' "
+                f"train.patch_size: found {size}, expected no more than the images' "
                 f"{min(views.height, views.width)} pixels"
             )
         self.views, self.size, self.warp = views, size, warp

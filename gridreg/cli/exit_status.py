@@ -8,17 +8,17 @@ from collections.abc import Callable
 
 from gridreg.errors import InputError
 
-__all__ = ["ending"]
+__all__ = ["run_cli"]
 
 
-def ending(program: Callable[[], int]) -> int:
+def run_cli(program: Callable[[], int]) -> int:
     """Run a program and give the exit status of what became of it.
 
     Bad input is one line ``error: ...`` on standard error and status 2, Ctrl-C one line and status 130. Anything else
     that is raised is a defect and keeps its traceback.
 
     Example:
-        >>> ending(lambda: 0)
+        >>> run_cli(lambda: 0)
         0
     """
     try:

@@ -1,6 +1,6 @@
-"""Arrays as pictures: colour scales with a legend, labels, and panels side by side.
+"""Arrays as images: colour scales with a legend, labels, and panels side by side.
 
-Pictures are ``(H, W, 3)`` uint8 arrays throughout.
+Images are ``(H, W, 3)`` uint8 arrays throughout.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from gridreg.errors import InputError
 from gridreg.training.files import write_bytes
 
 __all__ = [
-    "Picture",
+    "ImageArray",
     "coloured",
     "depth_limits",
     "fading_into_white",
@@ -29,34 +29,34 @@ __all__ = [
     "save_png",
     "scale_bar",
     "thumbnail",
-    "to_picture",
+    "to_uint8",
 ]
 
-Picture = NDArray[np.uint8]
+ImageArray = NDArray[np.uint8]
 
 _TEXT = 13
 _STRIP = 20
 
 
-def to_picture(image: Tensor) -> Picture:
-    """An image ``(H, W, 3)`` in [0, 1], clamped, as a picture; NaN becomes 0.
+def to_uint8(image: Tensor) -> ImageArray:
+    """An image ``(H, W, 3)`` in [0, 1], clamped, as an array of bytes; NaN becomes 0.
 
     Raises:
         InputError: for another shape.
 
     Example:
         >>> import torch
-        >>> to_picture(torch.full((1, 1, 3), 0.5)).tolist()
+        >>> to_uint8(torch.full((1, 1, 3), 0.5)).tolist()
         [[[128, 128, 128]]]
     """
     if image.ndim != 3 or image.shape[-1] != 3:
         raise InputError(f"image: shape {tuple(image.shape)}; expected (H, W, 3)")
     values = image.detach().double().nan_to_num(0).clamp(0, 1).cpu().numpy()
-    picture: Picture = np.round(values * 255).astype(np.uint8)
-    return picture
+    array: ImageArray = np.round(values * 255).astype(np.uint8)
+    return array
 
 
-def coloured(values: NDArray[np.floating], low: float, high: float, colours: str = "inferno") -> Picture:
+def coloured(values: NDArray[np.floating], low: float, high: float, colours: str = "inferno") -> ImageArray:
     """Numbers ``(H, W)`` as colours of a perceptually uniform scale; NaN gets the colour of ``high``.
 
     Args:
@@ -66,11 +66,11 @@ def coloured(values: NDArray[np.floating], low: float, high: float, colours: str
         colours: name of a matplotlib colour map.
     """
     share = np.clip((np.nan_to_num(values, nan=high) - low) / max(high - low, 1e-12), 0, 1)
-    picture: Picture = _table(colours)[np.round(share * 255).astype(np.intp)]
-    return picture
+    image: ImageArray = _table(colours)[np.round(share * 255).astype(np.intp)]
+    return image
 
 
-def scale_bar(height: int, low: float, high: float, colours: str = "inferno", unit: str = "") -> Picture:
+def scale_bar(height: int, low: float, high: float, colours: str = "inferno", unit: str = "") -> ImageArray:
     """The legend of ``coloured``: ``low`` below, ``high`` above, with figures and the unit.
 
     Args:
@@ -84,7 +84,7 @@ def scale_bar(height: int, low: float, high: float, colours: str = "inferno", un
     margin = min(_TEXT, height // 6)
     top = margin + (_STRIP if unit and height > 8 * _TEXT else 0)
     inner = max(height - margin - top, 2)
-    bar: Picture = np.full((height, width, 3), 255, np.uint8)
+    bar: ImageArray = np.full((height, width, 3), 255, np.uint8)
     ramp = np.linspace(high, low, inner)[:, None].repeat(12, axis=1)
     bar[top : top + inner, 4:16] = coloured(ramp, low, high, colours)[: height - top]
     image = Image.fromarray(bar)
@@ -108,57 +108,57 @@ def depth_limits(seen: Tensor) -> tuple[float, float]:
     return near - margin, far + margin
 
 
-def fading_into_white(picture: Picture, opacity: Tensor) -> Picture:
-    """The picture ``(H, W, 3)`` blended with white where the opacity ``(H, W)`` is below 1; NaN counts as 0."""
+def fading_into_white(image: ImageArray, opacity: Tensor) -> ImageArray:
+    """The image ``(H, W, 3)`` blended with white where the opacity ``(H, W)`` is below 1; NaN counts as 0."""
     share = opacity.detach().double().nan_to_num(0).clamp(0, 1).cpu().numpy()[..., None]
-    blended: Picture = np.round(picture * share + 255 * (1 - share)).astype(np.uint8)
+    blended: ImageArray = np.round(image * share + 255 * (1 - share)).astype(np.uint8)
     return blended
 
 
-def labelled(picture: Picture, text: str) -> Picture:
-    """The picture below a white strip with a text, cut off where the picture ends."""
-    strip = Image.new("RGB", (picture.shape[1], _STRIP), "white")
+def labelled(image: ImageArray, text: str) -> ImageArray:
+    """The image below a white strip with a text, cut off where the image ends."""
+    strip = Image.new("RGB", (image.shape[1], _STRIP), "white")
     ImageDraw.Draw(strip).text((3, 3), text, fill="black", font=_font())
-    return np.concatenate([np.asarray(strip), picture])
+    return np.concatenate([np.asarray(strip), image])
 
 
-def row(pictures: Sequence[Picture], gap: int = 4) -> Picture:
-    """Pictures from left to right on white, aligned at the top."""
-    height = max(picture.shape[0] for picture in pictures)
-    width = sum(picture.shape[1] for picture in pictures) + gap * (len(pictures) - 1)
-    result: Picture = np.full((height, width, 3), 255, np.uint8)
+def row(images: Sequence[ImageArray], gap: int = 4) -> ImageArray:
+    """Images from left to right on white, aligned at the top."""
+    height = max(image.shape[0] for image in images)
+    width = sum(image.shape[1] for image in images) + gap * (len(images) - 1)
+    result: ImageArray = np.full((height, width, 3), 255, np.uint8)
     left = 0
-    for picture in pictures:
-        result[: picture.shape[0], left : left + picture.shape[1]] = picture
-        left += picture.shape[1] + gap
+    for image in images:
+        result[: image.shape[0], left : left + image.shape[1]] = image
+        left += image.shape[1] + gap
     return result
 
 
-def thumbnail(picture: Picture, size: int) -> Picture:
-    """The picture scaled so that its longer side is ``size`` pixels; small pictures keep sharp pixels."""
-    height, width = picture.shape[:2]
+def thumbnail(image: ImageArray, size: int) -> ImageArray:
+    """The image scaled so that its longer side is ``size`` pixels; small images keep sharp pixels."""
+    height, width = image.shape[:2]
     scale = size / max(height, width)
     filter_ = Image.Resampling.NEAREST if scale >= 1 else Image.Resampling.BOX
     shape = (max(1, round(width * scale)), max(1, round(height * scale)))
-    return np.asarray(Image.fromarray(picture).resize(shape, filter_))
+    return np.asarray(Image.fromarray(image).resize(shape, filter_))
 
 
-def save_png(path: str | os.PathLike[str], picture: Picture) -> None:
+def save_png(path: str | os.PathLike[str], image: ImageArray) -> None:
     """Write a PNG, whole or not at all.
 
     Raises:
         InputError: if the place is not writable or the disk is full.
     """
     buffer = io.BytesIO()
-    Image.fromarray(picture).save(buffer, format="PNG")
+    Image.fromarray(image).save(buffer, format="PNG")
     write_bytes(path, buffer.getvalue())
 
 
 @lru_cache(maxsize=8)
-def _table(colours: str) -> Picture:
+def _table(colours: str) -> ImageArray:
     """The 256 colours of a map, ``(256, 3)``."""
     scale = matplotlib.colormaps[colours](np.linspace(0, 1, 256))[:, :3]
-    table: Picture = np.round(scale * 255).astype(np.uint8)
+    table: ImageArray = np.round(scale * 255).astype(np.uint8)
     return table
 
 
