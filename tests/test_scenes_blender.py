@@ -16,6 +16,8 @@ import torch
 from PIL import Image
 
 from gridreg.scenes import Protocol, builtin_scene, load_scene
+from gridreg.scenes.frames import StatedIntrinsics
+from gridreg.scenes.lens import LensDistortion
 from gridreg.scenes.protocols import First, Listed
 
 SIZE = 16
@@ -287,3 +289,10 @@ def test_a_relative_and_a_linked_scene_folder(
     expected = load_scene(scene, "builtin8")
     for folder in (Path("lego"), Path("link"), "lego"):
         assert torch.equal(load_scene(folder, "builtin8").train.rgba, expected.train.rgba)
+
+
+def test_the_text_in_fingerprints_stays_as_checkpoints_have_it() -> None:
+    assert StatedIntrinsics(angle_x=0.5, width=8, distortion=LensDistortion(k1=0.25)).fingerprint == (
+        "Camera(angle_x=0.5, fx=None, fy=None, cx=None, cy=None, width=8, height=None, "
+        "distortion=Distortion(k1=0.25, k2=0.0, p1=0.0, p2=0.0, k3=0.0, k4=0.0, k5=0.0, k6=0.0))"
+    )

@@ -45,6 +45,12 @@ class StatedIntrinsics:
         """Width and height, when both are given."""
         return None if self.width is None or self.height is None else (self.width, self.height)
 
+    @property
+    def fingerprint(self) -> str:
+        """Text that stands for these intrinsics in a scene's fingerprint; checkpoints hold it, so it never changes."""
+        text = str(self).replace("LensDistortion(", "Distortion(")
+        return text.replace("StatedIntrinsics(", "Camera(")
+
     def intrinsics(self, width: int, height: int) -> tuple[float, float, float, float]:
         """Return ``(fx, fy, cx, cy)`` in pixels for an image of this size."""
         fx = self.fx

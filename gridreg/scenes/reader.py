@@ -47,7 +47,7 @@ class ViewReader:
         paths: list[Path] = []
         for i in ids:
             path = resolve_inside(self._files.folder, frames[i].file_path, frames[i].where)
-            digest.update(f"{i} {frames[i].camera}".encode() + frames[i].pose.tobytes())
+            digest.update(f"{i} {frames[i].camera.fingerprint}".encode() + frames[i].pose.tobytes())
             image, values = self._read_frame(path, frames[i], digest)
             images.append(image)
             intrinsics.append(values)
