@@ -12,8 +12,7 @@ from torch import Tensor, nn
 
 import gridreg
 from gridreg.attach._hooks import slots_of
-from gridreg.attach._resolve import find
-from gridreg.attach.sites import raw_tensor
+from gridreg.attach._resolve import find, raw_tensor
 from tests.fields import DESIGNS, made, points
 from tests.observations import anatomy, same
 

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor, nn
 
 import gridreg
-from gridreg.attach._resolve import find
-from gridreg.attach.sites import Match, Selector, Site
+from gridreg.attach._resolve import Match, find
+from gridreg.attach.sites import Selector, Site
 
 
 class Block(nn.Module):

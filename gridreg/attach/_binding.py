@@ -10,8 +10,8 @@ from typing import Any, Literal
 from torch import Tensor, nn
 
 from gridreg.attach._hooks import Slot, attach, detach
-from gridreg.attach._resolve import find
-from gridreg.attach.sites import Grid, Match, Selector, SiteLike
+from gridreg.attach._resolve import Match, find
+from gridreg.attach.sites import Grid, Selector, SiteLike
 from gridreg.base import Clock, Context, Regularizer, overrides
 from gridreg.errors import InputError
 

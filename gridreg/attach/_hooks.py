@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from gridreg.attach._instance_class import STACKS, set_instance_class
-from gridreg.attach.sites import Match
+from gridreg.attach._resolve import Match
 from gridreg.base import Context, Regularizer
 from gridreg.errors import InputError
 

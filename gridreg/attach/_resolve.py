@@ -7,15 +7,15 @@ import fnmatch
 import inspect
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
 from torch import Tensor, nn
 
-from gridreg.attach.sites import Match, Place, Selector, Site, SiteLike
+from gridreg.attach.sites import Grid, Place, Selector, Site, SiteLike
 from gridreg.errors import InputError
 
-__all__ = ["find", "register_adapter", "sites_of"]
+__all__ = ["Match", "find", "raw_tensor", "register_adapter", "sites_of"]
 
 # DistributedDataParallel and DataParallel, and torch.compile.
 _WRAPPERS = re.compile(r"^((module|_orig_mod)\.)+")
@@ -23,6 +23,35 @@ _WRAPPERS = re.compile(r"^((module|_orig_mod)\.)+")
 Adapter: TypeAlias = Callable[[nn.Module], Mapping[str, "Site | Selector"]]
 
 _ADAPTERS: dict[type[nn.Module], Adapter] = {}
+
+
+@dataclass(eq=False)
+class Match:
+    """A place together with the module and the attribute that hold it."""
+
+    place: Place
+    module: nn.Module
+    attribute: str
+
+    def grid(self) -> Grid:
+        """The raw tensor behind this place."""
+        return Grid(
+            self.place.name,
+            raw_tensor(self.module, self.attribute),
+            self.place.dim,
+            self.place.spatial,
+            self.place.selected,
+        )
+
+
+def raw_tensor(module: nn.Module, attribute: str) -> Tensor:
+    """What `_parameters` or `_buffers` hold, past any property that is attached."""
+    tensor: Tensor | None = module._parameters.get(attribute)
+    if tensor is None:
+        tensor = module._buffers.get(attribute)
+    if tensor is None:
+        raise InputError(f"{attribute}: no longer a parameter or buffer of {type(module).__name__}")
+    return tensor
 
 
 def register_adapter(cls: type[nn.Module], function: Adapter) -> None:

@@ -1,26 +1,18 @@
-"""Sites: places on a field where features with a channel axis live, and how to name them."""
+"""Sites: tensors of a field that have a channel axis, as users and fields name them, and as regularizers see them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
-from gridreg.attach._places import Grid, Match, Place, raw_tensor
-from gridreg.attach.selectors import Selector, inputs, outputs, parameters
+import torch
+from torch import Tensor
 
-__all__ = [
-    "Grid",
-    "Match",
-    "Place",
-    "Selector",
-    "Site",
-    "SiteLike",
-    "inputs",
-    "outputs",
-    "parameters",
-    "raw_tensor",
-]
+from gridreg.attach.selectors import Kind, Selector, abridged, inputs, outputs, parameters
+from gridreg.errors import InputError
+
+__all__ = ["Grid", "Place", "Selector", "Site", "SiteLike", "inputs", "outputs", "parameters"]
 
 
 @dataclass(frozen=True)
@@ -52,3 +44,90 @@ class Site:
 
 SiteLike: TypeAlias = str | Selector | Site
 """What a regularizer accepts as a site: a declared name, a selector, or a `Site`."""
+
+
+@dataclass
+class Place:
+    """One tensor that a selector matched.
+
+    Attributes:
+        name: dotted name on the field, unique within its kind.
+        selector: what matched it.
+        dim: channel axis; not negative for parameters, as given for outputs and inputs.
+        spatial: spatial axes; empty for outputs and inputs.
+        octaves: octave of each channel that takes part, None where the site knows none.
+        size: length of the channel axis; None for outputs and inputs whose length shows at the first call.
+        selected: indices of the channels that take part, None for all.
+    """
+
+    name: str
+    selector: Selector
+    dim: int
+    spatial: tuple[int, ...] = ()
+    octaves: tuple[int, ...] | None = None
+    size: int | None = None
+    selected: tuple[int, ...] | None = None
+
+    @property
+    def kind(self) -> Kind:
+        """Whether it is a parameter, an output or an input."""
+        return self.selector.kind
+
+    @property
+    def channels(self) -> int | None:
+        """How many channels take part: the length of a mask at this place."""
+        return self.size if self.selected is None else len(self.selected)
+
+    def complete(self, size: int) -> None:
+        """Fill in the length of the channel axis, once it is known.
+
+        Raises:
+            InputError: the selected channels do not exist, or the octaves do not number one per channel.
+        """
+        selected, spec = None, self.selector.channels
+        if isinstance(spec, str):
+            start, stop, *step = (int(part) if part else None for part in spec.split(":"))
+            selected = tuple(range(size))[slice(start, stop, *step)]
+            if not selected or (stop or 0) > size:
+                raise InputError(f"channels={spec!r} of {self.selector}: {self.name} has {size} channels")
+        elif spec is not None:
+            selected = spec
+            if max(spec) >= size:
+                raise InputError(
+                    f"channels={abridged(spec)} of {self.selector}: {self.name} has {size} channels"
+                )
+        count = size if selected is None else len(selected)
+        if self.octaves is not None and len(self.octaves) != count:
+            raise InputError(
+                f"octaves of {self.selector}: found {len(self.octaves)}, "
+                f"expected one for each of the {count} channels of {self.name}"
+            )
+        self.size, self.selected = size, selected
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """A raw grid parameter, as penalties and optimizer hooks see it.
+
+    Attributes:
+        name: dotted name on the field.
+        parameter: the raw tensor, never masked or filtered.
+        dim: channel axis.
+        spatial: spatial axes.
+        selected: indices of the channels that take part, None for all.
+    """
+
+    name: str
+    parameter: Tensor = field(repr=False)
+    dim: int
+    spatial: tuple[int, ...]
+    selected: tuple[int, ...] | None = None
+
+    @property
+    def values(self) -> Tensor:
+        """The channels that take part, same axes as `parameter`."""
+        if self.selected is None:
+            return self.parameter
+        return self.parameter.index_select(
+            self.dim, torch.tensor(self.selected, device=self.parameter.device)
+        )
