@@ -1,14 +1,15 @@
-"""The one base class of all regularizers, the registry, and the context that their methods get."""
+"""The base class of all regularizers, their registry, and the context that their methods get."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar
 
 import torch
 from torch import Tensor
 
+from gridreg.attach.selectors import abridged
 from gridreg.attach.sites import Grid, Place, Selector, Site, SiteLike
 from gridreg.errors import InputError
 from gridreg.schedules import Numeric, check_numeric, end_step, resolve
@@ -20,7 +21,7 @@ __all__ = ["REGISTRY", "Clock", "Context", "LocalTerm", "Regularizer", "override
 
 
 class Clock:
-    """What all contexts of one handle share: the step, the length of the run, and the random generator.
+    """The step, the length of the run and the random generator that all contexts of one handle share.
 
     It survives `copy.deepcopy` and pickling, which a bare `torch.Generator` does not.
     """
@@ -41,7 +42,7 @@ class Clock:
 
 @dataclass
 class Context:
-    """What a regularizer's methods get to know.
+    """Step, tensor and memory that a regularizer's methods are called with.
 
     Attributes:
         clock: step, total_steps and generator of the handle.
@@ -53,7 +54,7 @@ class Context:
 
     clock: Clock
     place: Place | None = None
-    state: dict[str, Tensor] = field(default_factory=dict)
+    state: dict[str, Tensor] = field(default_factory=dict, repr=False)
     prepared_at: int | None = None
 
     @property
@@ -107,7 +108,7 @@ class LocalTerm:
 
     kind: Literal["total_variation", "l1", "l2"]
     scale: float
-    parameter: Tensor
+    parameter: Tensor = field(repr=False)
     spatial: tuple[int, ...]
     name: str = ""
 
@@ -116,15 +117,16 @@ class LocalTerm:
 class Regularizer:
     """Base of all regularizers: a frozen dataclass whose fields are its configuration.
 
-    A regularizer plays one or more parts. Each part is a method below that does nothing by default; the
-    handle finds out which parts a class plays by looking at what it overrides. Whatever changes during a run
-    lives in the context's state.
+    A regularizer overrides one or more of the methods below; each does nothing by default. Whatever changes
+    during a run lives in the context's state.
 
     Class attributes:
         acts_on: the part of a declared site that `transform` acts on: "mask" (channel masks) or "grids"
             (low-passes).
         train_only: skip `transform` while the module that owns the tensor is in eval mode.
-        weight: factor of the penalty, in subclasses that have one.
+
+    Two fields have a meaning where a subclass has them: `weight` is the factor of its penalties, and
+    `detach=True` says that `transform` leaves values as they are and changes only gradients.
     """
 
     acts_on: ClassVar[Literal["mask", "grids"]] = "mask"
@@ -143,7 +145,10 @@ class Regularizer:
         """Called at each `handle.step` and when attaching: compute what `transform` needs into the state."""
 
     def transform(self, value: Tensor, context: Context) -> Tensor:
-        """What the field gets to see at `context.place` instead of `value`. Called at each access."""
+        """The tensor that the field sees at `context.place` instead of `value`, a function of it and the state.
+
+        May be called once for several reads of a parameter that lie between two steps.
+        """
         return value
 
     def is_identity(self, context: Context) -> bool:
@@ -155,12 +160,8 @@ class Regularizer:
         return False
 
     def closed_channels(self, context: Context) -> Tensor | None:
-        """Which of the tensor's channels are exactly 0 after `transform`: ``(channels,)`` bool; None: none are."""
+        """Channels of the tensor that are exactly 0 after `transform`: ``(channels,)`` bool; None: none are."""
         return None
-
-    def gradient_only(self) -> bool:
-        """True: `transform` leaves the values as they are and changes only gradients."""
-        return False
 
     # --- losses ------------------------------------------------------------------------------------
 
@@ -213,37 +214,36 @@ class Regularizer:
 
     @classmethod
     def examples(cls, site: SiteLike) -> list[Regularizer]:
-        """Instances for the contract suite, at `site` where the class takes one."""
+        """Instances for `gridreg.testing.check_regularizer`, at `site` where the class takes one."""
         return []
 
 
 RegularizerClass = TypeVar("RegularizerClass", bound=type[Regularizer])
 
 REGISTRY: dict[str, type[Regularizer]] = {}
-"""Regularizer classes by name: what configurations and the contract suite know."""
+"""Regularizer classes by name, as configurations and the contract suite know them."""
 
 
 def register(cls: RegularizerClass) -> RegularizerClass:
     """Class decorator: make a regularizer known to `from_config` and to the contract suite by its class name.
 
     Raises:
-        InputError: not a frozen dataclass, or it does not override `examples`.
+        InputError: it is not a frozen dataclass.
     """
     # Of its own: the base class is a dataclass too, so `is_dataclass` would say yes to any subclass.
     if "__dataclass_params__" not in vars(cls) or not cls.__dataclass_params__.frozen:  # type: ignore[attr-defined]
         raise InputError(
             f"{cls.__name__}: a regularizer is a frozen dataclass; put @dataclass(frozen=True) below"
         )
-    if not overrides(cls, "examples"):
-        raise InputError(f"{cls.__name__}: a registered regularizer has a classmethod examples(site) -> list")
     REGISTRY[cls.__name__] = cls
     return cls
 
 
-def overrides(regularizer: Regularizer | type[Regularizer], part: str) -> bool:
-    """Whether a regularizer plays a part, that is, its class overrides the method of that name."""
+def overrides(regularizer: Regularizer | type[Regularizer], method: str | Callable[..., object]) -> bool:
+    """Whether a regularizer's class overrides a method of `Regularizer`, given as it is or by name."""
+    name = method if isinstance(method, str) else method.__name__
     cls = regularizer if isinstance(regularizer, type) else type(regularizer)
-    own, default = getattr(cls, part), getattr(Regularizer, part)
+    own, default = getattr(cls, name), getattr(Regularizer, name)
     return getattr(own, "__func__", own) is not getattr(default, "__func__", default)
 
 
@@ -260,6 +260,6 @@ def check_site(value: object) -> None:
     """
     if not isinstance(value, (str, Selector, Site)):
         raise InputError(
-            f"site={value!r}: expected the name of a declared site, or "
+            f"site={abridged(value)}: expected the name of a declared site, or "
             "gridreg.parameters(...), gridreg.outputs(...) or gridreg.inputs(...)"
         )

@@ -13,8 +13,8 @@ from torch import Tensor, nn
 import gridreg
 from gridreg.attach._hooks import slots_of
 from gridreg.attach._resolve import find, raw_tensor
-from tests.fields import DESIGNS, made, points
-from tests.observations import anatomy, same
+from gridreg.testing._subjects import anatomy, points, same
+from tests.fields import DESIGNS, made
 
 GROWING = [name for name, design in DESIGNS.items() if design.grow is not None]
 

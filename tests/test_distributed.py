@@ -11,7 +11,8 @@ import torch
 from torch import Tensor, nn
 
 import gridreg
-from tests.fields import made, points
+from gridreg.testing._subjects import points
+from tests.fields import made
 
 STEPS = (0, 4, 9)
 COMPOSITION = (

@@ -13,8 +13,8 @@ from torch import Tensor, nn
 import gridreg
 from gridreg.attach.sites import SiteLike
 from gridreg.base import Context, Regularizer
-from tests.fields import made, points
-from tests.observations import same, samples_of
+from gridreg.testing._subjects import points, same, samples_of
+from tests.fields import made
 
 LINE = gridreg.parameters("app_line.*", dim=1)
 

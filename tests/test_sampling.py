@@ -205,7 +205,6 @@ class TestDistanceGradientScaling:
         torch.testing.assert_close(gradient, ((samples.t / 10) ** 2).clamp(0, 1))
         assert scaled.colours is None
         assert DistanceGradientScaling(distance=3.0).value(at_step(0)) == 3
-        assert DistanceGradientScaling().gradient_only()
 
     def test_bad_arguments(self) -> None:
         for distance in (0.0, -1.0, float("nan")):

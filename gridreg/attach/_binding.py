@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import uuid
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -15,13 +15,19 @@ from gridreg.attach.sites import Grid, Selector, SiteLike
 from gridreg.base import Clock, Context, Regularizer, overrides
 from gridreg.errors import InputError
 
-__all__ = ["Attachment", "Row"]
+__all__ = ["READS_GRIDS", "Attachment", "Binding"]
 
-_READS_GRIDS = ("grid_penalty", "local_terms", "parameter_groups", "update_groups")
+READS_GRIDS = (
+    Regularizer.grid_penalty,
+    Regularizer.local_terms,
+    Regularizer.parameter_groups,
+    Regularizer.update_groups,
+)
+"""Methods that are given the raw grids of a site."""
 
 
 @dataclass
-class Row:
+class Binding:
     """One regularizer of a handle.
 
     Attributes:
@@ -40,9 +46,9 @@ class Row:
     matches: list[Match] = field(default_factory=list)
     slots: list[tuple[Match, Slot]] = field(default_factory=list)
 
-    def plays(self, *parts: str) -> bool:
-        """Whether the regularizer plays one of these parts."""
-        return any(overrides(self.regularizer, part) for part in parts)
+    def overrides(self, *methods: Callable[..., object]) -> bool:
+        """Whether the regularizer overrides one of these methods."""
+        return any(overrides(self.regularizer, method) for method in methods)
 
     @property
     def grids(self) -> list[Grid]:
@@ -64,7 +70,7 @@ class Attachment:
     def __init__(self, module: nn.Module, regularizers: Sequence[Regularizer], clock: Clock) -> None:
         self.field = module
         self.clock = clock
-        self.rows = _rows(regularizers, clock)
+        self.bindings = _bindings(regularizers, clock)
         self._owner = uuid.uuid4().hex
         # Contexts outlive slots, so that what a regularizer remembers survives replaced parameters.
         self._contexts: dict[tuple[str, str, str], Context] = {}
@@ -74,19 +80,19 @@ class Attachment:
 
     def attach(self) -> None:
         """Find all sites and attach; the field is left alone if one of them does not fit."""
-        resolved = [(row, *self._resolved(row)) for row in self.rows]
-        for row, matches, slots in resolved:
-            row.matches, row.slots = matches, slots
+        resolved = [(binding, *self._resolved(binding)) for binding in self.bindings]
+        for binding, matches, slots in resolved:
+            binding.matches, binding.slots = matches, slots
             for match, slot in slots:
                 attach(match, slot)
         # What belonged to tensors that are gone would not fit the field that loads the state.
-        used = {id(slot.context) for row in self.rows for _, slot in row.slots}
+        used = {id(slot.context) for binding in self.bindings for _, slot in binding.slots}
         self._contexts = {key: context for key, context in self._contexts.items() if id(context) in used}
         self._structure = _structure(self.field)
 
     def detach(self) -> None:
         """Take everything of this handle off, also off modules that were replaced since."""
-        for module in [match.module for row in self.rows for match, _ in row.slots]:
+        for module in [match.module for binding in self.bindings for match, _ in binding.slots]:
             detach(module, self._owner)
 
     def suspend(self) -> None:
@@ -111,22 +117,22 @@ class Attachment:
         """Bring all slots up to the clock's step."""
         self.sync()
         if self._suspensions == 0:
-            for row in self.rows:
-                with _naming(row):
-                    for _, slot in row.slots:
+            for binding in self.bindings:
+                with _naming(binding):
+                    for _, slot in binding.slots:
                         slot.refresh()
 
-    def _resolved(self, row: Row) -> tuple[list[Match], list[tuple[Match, Slot]]]:
+    def _resolved(self, binding: Binding) -> tuple[list[Match], list[tuple[Match, Slot]]]:
         """The grids that a regularizer reads, and a slot for each tensor that it transforms."""
         matches: list[Match] = []
         slots: list[tuple[Match, Slot]] = []
-        with _naming(row):
-            for site in row.regularizer.sites():
-                if row.plays(*_READS_GRIDS):
+        with _naming(binding):
+            for site in binding.regularizer.sites():
+                if binding.overrides(*READS_GRIDS):
                     matches += self._found(site, "grids")
-                if row.plays("transform"):
-                    found = self._found(site, type(row.regularizer).acts_on)
-                    slots += [(match, self._slot(row, match)) for match in found]
+                if binding.overrides(Regularizer.transform):
+                    found = self._found(site, type(binding.regularizer).acts_on)
+                    slots += [(match, self._slot(binding, match)) for match in found]
         return matches, slots
 
     def _found(self, site: SiteLike, part: Literal["mask", "grids"]) -> list[Match]:
@@ -139,9 +145,9 @@ class Attachment:
             )
         return matches
 
-    def _slot(self, row: Row, match: Match) -> Slot:
+    def _slot(self, binding: Binding, match: Match) -> Slot:
         """A slot with the context of this place, the one from before if the channels are the same."""
-        key = (row.name, match.place.kind, match.place.name)
+        key = (binding.name, match.place.kind, match.place.name)
         context = self._contexts.get(key)
         width = None if context is None or context.place is None else context.place.size
         if match.place.size is None and width is not None:
@@ -149,7 +155,7 @@ class Attachment:
         if context is None or context.place is None or context.place.channels != match.place.channels:
             context = self._contexts[key] = Context(self.clock)
         context.place = match.place
-        slot = Slot(self._owner, row.regularizer, context)
+        slot = Slot(self._owner, binding.regularizer, context)
         slot.refresh(prepare=context.prepared_at != self.clock.step)
         return slot
 
@@ -185,16 +191,16 @@ class Attachment:
             else:
                 memory[name] = tensor.detach().clone()
             known[prefix].prepared_at = self.clock.step
-        for row in self.rows:
-            for _, slot in row.slots:
+        for binding in self.bindings:
+            for _, slot in binding.slots:
                 slot.refresh(prepare=slot.context.prepared_at != self.clock.step)
 
 
 class _naming:
     """Put the regularizer's name in front of errors raised inside."""
 
-    def __init__(self, row: Row) -> None:
-        self._name = row.name
+    def __init__(self, binding: Binding) -> None:
+        self._name = binding.name
 
     def __enter__(self) -> None:
         """Nothing to do on entry."""
@@ -225,9 +231,9 @@ def _label(site: SiteLike) -> str:
     return ", ".join(selector.pattern for selector in site.selectors("mask") or site.selectors("grids"))
 
 
-def _rows(regularizers: Sequence[Regularizer], clock: Clock) -> list[Row]:
-    """A row for each regularizer, with a name that no other has."""
-    rows: list[Row] = []
+def _bindings(regularizers: Sequence[Regularizer], clock: Clock) -> list[Binding]:
+    """A binding for each regularizer, with a name that no other has."""
+    bindings: list[Binding] = []
     counts: dict[str, int] = {}
     for regularizer in regularizers:
         label = ", ".join(_label(site) for site in regularizer.sites())
@@ -235,5 +241,5 @@ def _rows(regularizers: Sequence[Regularizer], clock: Clock) -> list[Row]:
         counts[name] = counts.get(name, 0) + 1
         if counts[name] > 1:
             name = f"{name} #{counts[name]}"
-        rows.append(Row(name, regularizer, Context(clock), label))
-    return rows
+        bindings.append(Binding(name, regularizer, Context(clock), label))
+    return bindings

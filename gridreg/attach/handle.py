@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from types import TracebackType
@@ -13,7 +13,7 @@ from weakref import WeakKeyDictionary, ref
 import torch
 from torch import Tensor, nn
 
-from gridreg.attach._binding import Attachment, Row
+from gridreg.attach._binding import Attachment, Binding
 from gridreg.attach._table import table
 from gridreg.base import LocalTerm, Regularizer
 from gridreg.errors import InputError
@@ -43,7 +43,7 @@ class Handle:
     @property
     def regularizers(self) -> tuple[Regularizer, ...]:
         """What is applied, in order."""
-        return tuple(row.regularizer for row in self._attachment.rows)
+        return tuple(binding.regularizer for binding in self._attachment.bindings)
 
     @property
     def total_steps(self) -> int:
@@ -79,37 +79,37 @@ class Handle:
         Raises:
             InputError: a penalty needs samples, or an attribute of them, that are not there.
         """
-        rows = self._rows("penalty", "grid_penalty")
-        names = [row.name for row in rows]
+        bindings = self._bindings(Regularizer.penalty, Regularizer.grid_penalty)
+        names = [binding.name for binding in bindings]
         unknown = sorted(set(exclude) - set(names))
         if unknown:
             raise InputError(f"exclude={unknown}: expected names of penalties, which are {names}")
         self._attachment.sync()
         self.terms = {}
         total = _zero(self._attachment.field, samples)
-        for row in rows:
-            if row.name not in exclude:
-                part = self._penalty(row, samples)
-                self.terms[row.name] = part.detach()
+        for binding in bindings:
+            if binding.name not in exclude:
+                part = self._penalty(binding, samples)
+                self.terms[binding.name] = part.detach()
                 total = total + part
         return total
 
-    def _penalty(self, row: Row, samples: RaySamples | None) -> Tensor:
+    def _penalty(self, binding: Binding, samples: RaySamples | None) -> Tensor:
         """Weighted penalty of one regularizer; at weight 0 it is not computed."""
-        weight = _weight(row)
+        weight = _weight(binding)
         total = _zero(self._attachment.field, samples)
-        if weight != 0 and row.plays("penalty"):
+        if weight != 0 and binding.overrides(Regularizer.penalty):
             if samples is None:
-                raise InputError(f"{row.name}: needs samples; call handle.loss(samples)")
-            for attribute in row.regularizer.needs():
+                raise InputError(f"{binding.name}: needs samples; call handle.loss(samples)")
+            for attribute in binding.regularizer.needs():
                 if getattr(samples, attribute, None) is None:
                     raise InputError(
-                        f"{row.name}: needs samples.{attribute}, found None; "
+                        f"{binding.name}: needs samples.{attribute}, found None; "
                         "use a renderer that fills it in, or drop the regularizer"
                     )
-            total = total + weight * row.regularizer.penalty(samples, row.context)
-        if weight != 0 and row.plays("grid_penalty"):
-            total = total + weight * row.regularizer.grid_penalty(row.grids, row.context)
+            total = total + weight * binding.regularizer.penalty(samples, binding.context)
+        if weight != 0 and binding.overrides(Regularizer.grid_penalty):
+            total = total + weight * binding.regularizer.grid_penalty(binding.grids, binding.context)
         return total
 
     def grid_terms(self) -> list[LocalTerm]:
@@ -117,48 +117,48 @@ class Handle:
 
         Pass the names of those that the optimizer took over to `loss(samples, exclude=names)`.
         """
-        rows = self._rows("local_terms")
+        bindings = self._bindings(Regularizer.local_terms)
         self._attachment.sync()
         terms = []
-        for row in rows:
-            weight = _weight(row)
+        for binding in bindings:
+            weight = _weight(binding)
             if weight != 0:
-                for term in row.regularizer.local_terms(row.grids, row.context):
-                    terms.append(replace(term, name=row.name, scale=term.scale * weight))
+                for term in binding.regularizer.local_terms(binding.grids, binding.context):
+                    terms.append(replace(term, name=binding.name, scale=term.scale * weight))
         return terms
 
     # --- hooks for a renderer and a trainer; each is a no-op if no regularizer plays the part ----
 
     def on_samples(self, samples: RaySamples) -> RaySamples:
         """The samples as compositing and losses are to see them."""
-        for row in self._rows("on_samples"):
-            samples = row.regularizer.on_samples(samples, row.context)
+        for binding in self._bindings():
+            samples = binding.regularizer.on_samples(samples, binding.context)
         return samples
 
     def background(
         self, count: int, generator: torch.Generator, default: Tensor | None = None
     ) -> Tensor | None:
         """Background colours `(count, 3)` behind training rays and their targets, or the default."""
-        for row in self._rows("background"):
-            default = row.regularizer.background(count, generator, default, row.context)
+        for binding in self._bindings():
+            default = binding.regularizer.background(count, generator, default, binding.context)
         return default
 
     def near_far(self, near: Tensor, far: Tensor) -> tuple[Tensor, Tensor]:
         """Interval of the training rays, world units, shapes `(R,)`."""
-        for row in self._rows("near_far"):
-            near, far = row.regularizer.near_far(near, far, row.context)
+        for binding in self._bindings():
+            near, far = binding.regularizer.near_far(near, far, binding.context)
         return near, far
 
     def parameter_groups(self, groups: list[dict[str, Any]]) -> list[dict[str, Any]]:
         """Parameter groups for an optimizer, split or changed; ask whenever one is made."""
-        for row in self._rows("parameter_groups"):
-            groups = row.regularizer.parameter_groups(groups, row.grids, row.context)
+        for binding in self._bindings():
+            groups = binding.regularizer.parameter_groups(groups, binding.grids, binding.context)
         return groups
 
     def update_groups(self, groups: list[dict[str, Any]]) -> None:
         """Update what schedules drive in an optimizer's `param_groups`, in place; ask at each step."""
-        for row in self._rows("update_groups"):
-            row.regularizer.update_groups(groups, row.grids, row.context)
+        for binding in self._bindings():
+            binding.regularizer.update_groups(groups, binding.grids, binding.context)
 
     # --- suspending and removing -----------------------------------------------------------------
 
@@ -209,7 +209,7 @@ class Handle:
         return {
             "step": clock.step,
             "total_steps": clock.total_steps,
-            "regularizers": [row.name for row in self._attachment.rows],
+            "regularizers": [binding.name for binding in self._attachment.bindings],
             "generator": clock.generator.get_state(),
             "state": self._attachment.state(),
         }
@@ -236,15 +236,15 @@ class Handle:
 
     def values(self) -> dict[str, float]:
         """One number per regularizer for curves: the open share of a mask, the weight of a penalty."""
-        return {row.name: row.value() for row in self._rows()}
+        return {binding.name: binding.value() for binding in self._bindings()}
 
     def masks(self) -> dict[str, Tensor]:
         """The masks of this step by regularizer name, each ``(channels,)``, for curves; a copy."""
         found = {}
-        for row in self._rows():
-            for _, slot in row.slots:
+        for binding in self._bindings():
+            for _, slot in binding.slots:
                 if "mask" in slot.context.state:
-                    found[row.name] = slot.context.state["mask"].clone()
+                    found[binding.name] = slot.context.state["mask"].clone()
                     break
         return found
 
@@ -257,25 +257,29 @@ class Handle:
             f"gridreg on {type(self._attachment.field).__name__}, step {clock.step} of {clock.total_steps}"
         )
         return (
-            title + "\n" + table(("regularizer", "site", "channels", "value now"), map(_cells, self._rows()))
+            title
+            + "\n"
+            + table(("regularizer", "site", "channels", "value now"), map(_cells, self._bindings()))
         )
 
-    def _rows(self, *parts: str) -> list[Row]:
-        """Rows whose regularizers play one of these parts, all without any."""
+    def _bindings(self, *methods: Callable[..., object]) -> list[Binding]:
+        """Rows whose regularizers override one of these methods, all without any."""
         self._require_applied()
-        return [row for row in self._attachment.rows if not parts or row.plays(*parts)]
+        return [
+            binding for binding in self._attachment.bindings if not methods or binding.overrides(*methods)
+        ]
 
     def _require_applied(self) -> None:
         if self._removed:
             raise InputError("handle: it was removed; call gridreg.apply again for a new one")
 
 
-def _weight(row: Row) -> float:
+def _weight(binding: Binding) -> float:
     """The weight of a penalty now."""
     try:
-        return row.context.at(getattr(row.regularizer, "weight", 1.0), "weight", low=0.0)
+        return binding.context.at(getattr(binding.regularizer, "weight", 1.0), "weight", low=0.0)
     except InputError as error:
-        raise InputError(f"{row.name}: {error}") from None
+        raise InputError(f"{binding.name}: {error}") from None
 
 
 def _zero(field: nn.Module, samples: RaySamples | None) -> Tensor:
@@ -284,10 +288,10 @@ def _zero(field: nn.Module, samples: RaySamples | None) -> Tensor:
     return torch.zeros((), device=None if first is None else first.device)
 
 
-def _cells(row: Row) -> tuple[str, str, str, str]:
+def _cells(binding: Binding) -> tuple[str, str, str, str]:
     """A regularizer's line in the table."""
-    sizes = [match.place.channels for match, _ in row.slots]
+    sizes = [match.place.channels for match, _ in binding.slots]
     counts = sorted({"?" if size is None else str(size) for size in sizes})
     channels = (f"{len(sizes)} x " if len(sizes) > 1 else "") + ", ".join(counts)
-    value = "?" if math.isnan(row.value()) else f"{row.value():.4g}"
-    return type(row.regularizer).__name__, row.label or "samples", channels or "-", value
+    value = "?" if math.isnan(binding.value()) else f"{binding.value():.4g}"
+    return type(binding.regularizer).__name__, binding.label or "samples", channels or "-", value

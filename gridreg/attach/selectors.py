@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
+from torch import Tensor, nn
+
 from gridreg.errors import InputError
 
 __all__ = ["Kind", "Selector", "abridged", "inputs", "outputs", "parameters"]
@@ -139,7 +141,9 @@ def _normalised_channels(channels: slice | Sequence[int] | str | None) -> tuple[
     return indices
 
 
-def abridged(values: object) -> str:
-    """Short text for an error or a table."""
-    text = repr(values)
-    return text if len(text) <= 40 else text[:36] + "...)"
+def abridged(value: object) -> str:
+    """One short line about a value, for an error or a table: never the numbers in a tensor or the parts of a module."""
+    if isinstance(value, Tensor):
+        return f"{type(value).__name__} of shape {tuple(value.shape)}"
+    text = type(value).__name__ if isinstance(value, nn.Module) else " ".join(repr(value).split())
+    return text if len(text) <= 40 else text[:36] + "..." + text[-1]

@@ -112,10 +112,6 @@ class DistanceGradientScaling(Regularizer):
         """`scale_gradients_by_distance` with the distance of this step."""
         return scale_gradients_by_distance(samples, context.at(self.distance, "distance", low=0.0))
 
-    def gradient_only(self) -> bool:
-        """No value changes."""
-        return True
-
     def value(self, context: Context) -> float:
         """Distance from which on gradients count in full."""
         return context.at(self.distance, "distance", low=0.0)

@@ -73,10 +73,6 @@ class Mask(Regularizer):
         end = self.end(max(ranks, default=0) + 1, context.total_steps)
         return end is not None and context.step >= end
 
-    def gradient_only(self) -> bool:
-        """Whether values stay and only gradients change."""
-        return self.detach
-
     def closed_channels(self, context: Context) -> Tensor | None:
         """Where the mask is 0."""
         closed: Tensor = context.state["mask"] <= 0

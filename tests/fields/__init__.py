@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import torch
-from torch import Tensor, nn
+from torch import nn
 
 import gridreg
-from gridreg.attach.sites import SiteLike
+from gridreg.testing import Subject
 from tests.fields.coordinate_mlp import NerfMLP
 from tests.fields.hash_grid import InstantField
 from tests.fields.kplanes import KPlanesField
@@ -69,65 +68,52 @@ def attach_mlp(field: NerfMLP) -> gridreg.Handle:
 
 
 @dataclass(frozen=True)
-class Design:
-    """A foreign field: its class, a user's lines, sites for every kind of regularizer, and how it grows."""
+class Design(Subject):
+    """A foreign field with, besides sites for every kind of regularizer, a user's lines, and how it grows."""
 
-    make: Callable[[], nn.Module]
     attach: Callable[[nn.Module], gridreg.Handle]
-    mask_sites: tuple[SiteLike, ...]
-    grid_site: SiteLike
     grow: Callable[[nn.Module], None] | None = None
 
 
 DESIGNS: dict[str, Design] = {
     "voxel": Design(
         DirectVoxelField,
-        attach_voxel,
         (gridreg.parameters("k0.grid", dim=1), gridreg.outputs("k0")),
         gridreg.parameters("*.grid", dim=1, spatial=(2, 3, 4)),
+        attach_voxel,
         DirectVoxelField.grow,
     ),
     "hash": Design(
         InstantField,
-        attach_hash,
         (
             gridreg.outputs("encoder", octaves=[0, 0, 1, 1, 2, 2, 3, 3]),
             gridreg.inputs("sigma_net.0"),
         ),
         gridreg.parameters("encoder.levels.*.weight", dim=1),
+        attach_hash,
     ),
     "kplanes": Design(
         KPlanesField,
-        attach_kplanes,
         (gridreg.parameters("grids.*.*", dim=1), gridreg.inputs("sigma_net.0", channels=slice(2, 14))),
         gridreg.parameters("grids.*.*", dim=1),
+        attach_kplanes,
     ),
     "tensorf": Design(
         TensorField,
-        attach_tensorf,
         (gridreg.parameters("app_line.*", dim=1), gridreg.inputs("mlp.0", octaves=[-1] * 9 + [0, 1] * 18)),
         gridreg.parameters("density_*.*", dim=1),
+        attach_tensorf,
         TensorField.upsample_volume_grid,
     ),
     "mlp": Design(
         NerfMLP,
-        attach_mlp,
         (gridreg.inputs("trunk.0", octaves=gridreg.octaves_of_channels(3, 6, "sines_first")),),
         gridreg.parameters("trunk.*.weight", dim=0),
+        attach_mlp,
     ),
 }
 
 
 def made(name: str) -> nn.Module:
     """A design with the same random values each time."""
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        return DESIGNS[name].make()
-
-
-def points(count: int = 24, seed: int = 0) -> tuple[Tensor, Tensor]:
-    """Positions in [-1, 1]^3 and unit directions."""
-    generator = torch.Generator().manual_seed(seed)
-    x = 1.9 * torch.rand(count, 3, generator=generator) - 0.95
-    d = torch.randn(count, 3, generator=generator)
-    return x, d / d.norm(dim=-1, keepdim=True)
+    return DESIGNS[name].made()
