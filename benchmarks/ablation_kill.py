@@ -40,7 +40,7 @@ set:
   train.filter_rays_at: []
   train.occupancy_resolution: 24
   train.checkpoint_minutes: 0.005
-compositions: [none, tensorf, quick, fourierf, sanerf, {{name: quick, remove: [FrequencyMask]}}]
+compositions: [none, tensorf, quick, fourierf, composition:sanerf, {{name: quick, remove: [FrequencyMask]}}]
 """
 
 

@@ -1,5 +1,7 @@
 """Regularizers for grid radiance fields, attached from the outside."""
 
+from typing import Any
+
 from gridreg.attach._hooks import open_channels, strip
 from gridreg.attach._resolve import register_adapter, sites_of
 from gridreg.attach.apply import apply
@@ -9,11 +11,11 @@ from gridreg.base import REGISTRY, Clock, Context, LocalTerm, Regularizer, overr
 from gridreg.compositions.named import composition, composition_names, register_composition
 from gridreg.compositions.plain_data import from_config, to_config
 from gridreg.encodings import PositionalEncoding, octaves_of_channels, positional_encoding
-from gridreg.errors import InputError
+from gridreg.errors import RENAMED, InputError
 from gridreg.regularizers.backgrounds import (
     ExpectedBackground,
     RandomBackground,
-    SpaceAnnealing,
+    SampleSpaceAnnealing,
     anneal_space,
     opacity_error,
     random_background,
@@ -25,7 +27,7 @@ from gridreg.regularizers.filters import fourier_low_pass, gaussian_blur
 from gridreg.regularizers.gradient_scaling import DistanceGradientScaling, scale_gradients_by_distance
 from gridreg.regularizers.grids import L1, Orthogonality, TotalVariation, l1, orthogonality, total_variation
 from gridreg.regularizers.level_masks import LevelMask, ViewDependenceMask
-from gridreg.regularizers.low_pass import FourierLowPass, SpatialAnnealing, annealed_radius
+from gridreg.regularizers.low_pass import FourierLowPass, GridBlur, annealed_radius
 from gridreg.regularizers.mask_base import Mask
 from gridreg.regularizers.mask_functions import (
     authors_frequency_mask,
@@ -39,7 +41,7 @@ from gridreg.regularizers.mask_functions import (
 from gridreg.regularizers.optimizer import LearningRate, WeightDecay, split_groups
 from gridreg.regularizers.patches import DepthSmoothness, RayKL, depth_smoothness, ray_kl
 from gridreg.regularizers.rays import (
-    Distortion,
+    DistortionLoss,
     OpacityEntropy,
     RayEntropy,
     distortion,
@@ -68,7 +70,7 @@ __all__ = [
     "CosineMask",
     "DepthSmoothness",
     "DistanceGradientScaling",
-    "Distortion",
+    "DistortionLoss",
     "ExpectedBackground",
     "FixedMask",
     "FourierLowPass",
@@ -99,8 +101,8 @@ __all__ = [
     "Schedule",
     "Selector",
     "Site",
-    "SpaceAnnealing",
-    "SpatialAnnealing",
+    "SampleSpaceAnnealing",
+    "GridBlur",
     "TotalVariation",
     "ViewDependenceMask",
     "WeightDecay",
@@ -151,3 +153,10 @@ __all__ = [
     "to_config",
     "total_variation",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Refuse a name that went with the one that took its place."""
+    if name in RENAMED:
+        raise InputError(f"gridreg.{name}: it is called gridreg.{RENAMED[name]} now")
+    raise AttributeError(f"module 'gridreg' has no attribute {name!r}")

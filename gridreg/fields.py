@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable
 from importlib.metadata import entry_points
 from typing import Any
 
 from torch import nn
 
-from gridreg.errors import InputError
+from gridreg.errors import InputError, near_names
 
 __all__ = ["field_names", "make_field", "register_field"]
 
@@ -46,8 +45,7 @@ def make_field(name: str, *arguments: Any, **options: Any) -> nn.Module:
         found = [entry for entry in entry_points(group="gridreg.fields") if entry.name == name]
         if not found:
             known = field_names()
-            near = difflib.get_close_matches(name, known, n=1)
-            hint = f"; did you mean {near[0]!r}?" if near else ""
+            hint = near_names(name, known)
             raise InputError(f"backbone: found {name!r}, expected one of {', '.join(known)}{hint}")
         constructor = found[0].load()
     try:

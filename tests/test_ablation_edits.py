@@ -16,9 +16,11 @@ from gridreg.ablation.edits import (
     replaced,
     title_of,
 )
+from gridreg.compositions.named import RETIRED
 from gridreg.errors import InputError
+from gridreg.training.presets import preset_names
 
-FEW = known_composition("few_tensorf")
+FEW = known_composition("composition:few_tensorf")
 
 
 def titles(plain):
@@ -27,7 +29,30 @@ def titles(plain):
 
 def test_known_compositions_are_those_of_the_toolkit():
     for name in gridreg.composition_names():
-        assert gridreg.from_config(known_composition(name)) == gridreg.composition(name)
+        assert gridreg.from_config(known_composition(f"composition:{name}")) == gridreg.composition(name)
+
+
+def test_no_name_means_a_composition_to_one_and_a_preset_to_another():
+    for name in {*gridreg.composition_names(), *preset_names()} - {*RETIRED}:
+        meanings = [
+            known_composition(f"{kind}:{name}")
+            for kind, names in (("composition", gridreg.composition_names()), ("preset", preset_names()))
+            if name in names
+        ]
+        if all(meaning == meanings[0] for meaning in meanings):
+            assert known_composition(name) == meanings[0]
+        else:
+            with pytest.raises(InputError, match=f"write composition:{name} or preset:{name}$"):
+                known_composition(name)
+
+
+def test_the_retired_composition_says_what_to_write():
+    for name in ("few_tensorf_finetuned", "composition:few_tensorf_finetuned"):
+        with pytest.raises(
+            InputError, match=r"as published it is 'few_tensorf'.*preset:few_tensorf_finetuned"
+        ):
+            known_composition(name)
+    assert "RandomBackground" in titles(known_composition("preset:few_tensorf_finetuned"))
 
 
 def test_presets_hold_compositions_too():
@@ -64,8 +89,8 @@ def test_selectors(selector, count):
 @pytest.mark.parametrize(
     ("selector", "message"),
     [
-        ("FrequencMask", "unknown regularizer 'FrequencMask', did you mean 'FrequencyMask'"),
-        ({"nam": "L1"}, "unknown key 'nam', did you mean 'name'"),
+        ("FrequencMask", "unknown regularizer 'FrequencMask'; did you mean 'FrequencyMask'"),
+        ({"nam": "L1"}, "unknown key 'nam'; did you mean 'name'"),
         ({}, "expected NAME"),
         (3, "expected NAME"),
     ],

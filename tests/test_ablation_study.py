@@ -27,14 +27,14 @@ def names(row):
 
 
 def test_a_name_is_a_row():
-    (row,) = expand_rows("few_tensorf")
+    (row,) = expand_rows("composition:few_tensorf")
     assert row.label == "few_tensorf"
     assert gridreg.from_config(row.plain) == gridreg.composition("few_tensorf")
 
 
 def test_edits_make_the_label():
     entry = {
-        "name": "few_tensorf",
+        "name": "composition:few_tensorf",
         "remove": ["L1", {"name": "FrequencyMask", "site": "encoding.*"}],
         "replace": [{"name": "OcclusionLoss", "with": {"weight": 0.1}}],
         "add": ["RandomBackground"],
@@ -79,8 +79,8 @@ def test_one_at_a_time():
 
 def test_one_at_a_time_on_something():
     entry = {
-        "one_at_a_time": "few_tensorf",
-        "on": {"name": "few_tensorf", "remove": ["FrequencyMask"], "label": "bare"},
+        "one_at_a_time": "composition:few_tensorf",
+        "on": {"name": "composition:few_tensorf", "remove": ["FrequencyMask"], "label": "bare"},
         "parts": {"density": "FrequencyMask density", "encodings": "FrequencyMask encoding.*"},
     }
     rows = expand_rows(entry)
@@ -89,7 +89,7 @@ def test_one_at_a_time_on_something():
 
 
 def test_the_product_is_every_subset():
-    rows = expand_rows({"product": "few_tensorf"})
+    rows = expand_rows({"product": "preset:few_tensorf"})
     assert len(rows) == 2**5
     assert len({row.label for row in rows}) == 2**5
     assert len({str(row.plain) for row in rows}) == 2**5
@@ -107,7 +107,12 @@ def test_a_product_too_large_is_refused():
 
 def test_sweep_of_an_argument():
     rows = expand_rows(
-        {"sweep": "few_tensorf", "change": "FrequencyMask", "argument": "until", "values": [0.5, 300]}
+        {
+            "sweep": "composition:few_tensorf",
+            "change": "FrequencyMask",
+            "argument": "until",
+            "values": [0.5, 300],
+        }
     )
     assert [row.label for row in rows] == ["few_tensorf, until=0.5", "few_tensorf, until=300"]
     assert [{r["until"] for r in row.plain if r["name"] == "FrequencyMask"} for row in rows] == [{0.5}, {300}]
@@ -131,9 +136,9 @@ def test_sweep_of_a_value():
         (3, "expected the name of a composition or a mapping"),
         ("few_tensor", "unknown composition 'few_tensor'"),
         ({}, "expected exactly one of name"),
-        ({"nam": "none"}, "unknown key 'nam', did you mean 'name'"),
+        ({"nam": "none"}, "unknown key 'nam'; did you mean 'name'"),
         ({"name": "none", "product": "none"}, "found name and product, expected exactly one"),
-        ({"name": "none", "removed": ["L1"]}, "unknown key 'removed', did you mean 'remove'"),
+        ({"name": "none", "removed": ["L1"]}, "unknown key 'removed'; did you mean 'remove'"),
         ({"name": ["none"]}, "name: found"),
         ({"name": "none", "label": " "}, "label: found ' '"),
         ({"name": "none", "steps": 0}, "steps: found 0"),
@@ -299,7 +304,10 @@ def test_two_scenes_of_one_name_are_refused(tmp_path):
             "compositions: [none]\nmodules: [no_such_module_here]",
             "modules: cannot import 'no_such_module_here'",
         ),
-        ("compositions: [none, few_tensorf]", r"row 'few_tensorf' with preset quick: .*encoding\.position"),
+        (
+            "compositions: [none, composition:few_tensorf]",
+            r"row 'few_tensorf' with preset quick: .*encoding\.position",
+        ),
         ("compositions: [none]\nset: {field.decoder: nonsense}", "row 'none' with preset quick: .*nonsense"),
         ("compositions: none", "expected a list"),
         ("compositions: [none", "not valid YAML"),
@@ -362,10 +370,10 @@ def test_the_tiny_study_of_these_tests():
 def test_hashes_are_one_for_each_run(composition, seeds, views):
     preset = {"few": "few_tensorf", "fre": "freenerf_quick"}.get(composition[:3], "quick")
     study = study_from_text(
-        f"compositions: [{composition}]\npresets: [{preset}]\nseeds: {seeds}\nviews: {views}"
+        f"compositions: [composition:{composition}]\npresets: [{preset}]\nseeds: {seeds}\nviews: {views}"
     )
     assert len(study.hashes) == len(study.runs) == len(seeds) * len(views)
     again = study_from_text(
-        f"compositions: [{composition}]\npresets: [{preset}]\nseeds: {seeds}\nviews: {views}"
+        f"compositions: [composition:{composition}]\npresets: [{preset}]\nseeds: {seeds}\nviews: {views}"
     )
     assert again.hashes == study.hashes

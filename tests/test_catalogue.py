@@ -44,7 +44,7 @@ def test_every_regularizer_has_a_complete_row(catalogue: ModuleType, cls: type[R
         ("FourierLowPass", "P"),
         ("OcclusionLoss", "L"),
         ("TotalVariation", "L"),
-        ("SpaceAnnealing", "S"),
+        ("SampleSpaceAnnealing", "S"),
         ("RandomBackground", "D"),
         ("WeightDecay", "O"),
         ("DistanceGradientScaling", "F"),

@@ -248,16 +248,32 @@ def test_the_fixed_variant_keeps_the_same_share_open_on_the_same_sites() -> None
     assert len(changed) == 5
 
 
+@pytest.mark.parametrize(("old", "new"), gridreg.errors.RENAMED.items())
+def test_a_name_that_went_is_refused_with_the_one_that_took_its_place(old: str, new: str) -> None:
+    assert issubclass(getattr(gridreg, new), Regularizer)
+    with pytest.raises(gridreg.InputError, match=f"gridreg.{old}: it is called gridreg.{new} now"):
+        getattr(gridreg, old)
+    with pytest.raises(gridreg.InputError, match=f"unknown regularizer '{old}'; it is called '{new}' now"):
+        gridreg.from_config([{"name": old}])
+
+
+def test_an_unknown_name_is_an_attribute_error() -> None:
+    assert not hasattr(gridreg, "Nothing")
+
+
+def test_the_fine_tuned_row_is_no_composition_of_its_own() -> None:
+    with pytest.raises(gridreg.InputError, match=r"as published it is 'few_tensorf'.*preset of this name"):
+        gridreg.composition("few_tensorf_finetuned")
+
+
 def test_rivals_are_there() -> None:
-    assert {"tensorf", "few_tensorf", "few_tensorf_finetuned", "freenerf", "fourierf", "sanerf"} <= set(
-        gridreg.composition_names()
-    )
+    assert {"tensorf", "few_tensorf", "freenerf", "fourierf", "sanerf"} <= set(gridreg.composition_names())
     kinds = {
         name: {type(r).__name__ for r in gridreg.composition(name)} for name in gridreg.composition_names()
     }
     assert kinds["freenerf"] == {"FrequencyMask", "OcclusionLoss"}
     assert {"FourierLowPass", "WeightDecay"} <= kinds["fourierf"]
-    assert {"SpatialAnnealing", "ViewDependenceMask"} <= kinds["sanerf"]
+    assert {"GridBlur", "ViewDependenceMask"} <= kinds["sanerf"]
 
 
 def test_an_unknown_composition_is_refused_and_a_new_one_can_be_registered() -> None:

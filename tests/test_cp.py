@@ -142,7 +142,7 @@ def test_removing_masks_restores_the_field_exactly():
     before, keys = seen(field), list(field.state_dict())
     composition = [
         gridreg.FrequencyMask("density"),
-        gridreg.SpatialAnnealing("appearance"),
+        gridreg.GridBlur("appearance"),
         gridreg.TotalVariation("density", weight=1e-3),
     ]
     handle = gridreg.apply(field, *composition, total_steps=20)

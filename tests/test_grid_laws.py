@@ -79,7 +79,7 @@ def test_all_of_the_catalogue_take_part() -> None:
     assert names >= {"TotalVariation", "L1", "Orthogonality"}
     assert {type(e).__name__ for e in examples("transform", "grids")} >= {
         "FourierLowPass",
-        "SpatialAnnealing",
+        "GridBlur",
     }
 
 

@@ -219,7 +219,7 @@ def test_hooks_reach_the_regularizers_that_play_the_part() -> None:
     with gridreg.apply(
         field,
         gridreg.RandomBackground(),
-        gridreg.SpaceAnnealing(until=10),
+        gridreg.SampleSpaceAnnealing(until=10),
         gridreg.WeightDecay(LINE, decay=gridreg.Linear(0.1, 0.2)),
         total_steps=10,
     ) as handle:

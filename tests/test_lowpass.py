@@ -17,7 +17,7 @@ import gridreg
 from gridreg.base import Clock, Context
 from gridreg.errors import InputError
 from gridreg.regularizers.filters import fourier_low_pass, gaussian_blur, low_pass_response
-from gridreg.regularizers.low_pass import FourierLowPass, SpatialAnnealing, annealed_radius
+from gridreg.regularizers.low_pass import FourierLowPass, GridBlur, annealed_radius
 from gridreg.schedules import Linear
 from tests import oracles
 
@@ -192,7 +192,7 @@ LINES, PLANES = gridreg.parameters("grids.0", dim=-1), gridreg.parameters("grids
 class TestAttached:
     @pytest.mark.parametrize(
         "regularizer",
-        [FourierLowPass(PLANES, Linear(0.1, 1.0, until=0.5)), SpatialAnnealing(PLANES, until=50)],
+        [FourierLowPass(PLANES, Linear(0.1, 1.0, until=0.5)), GridBlur(PLANES, until=50)],
     )
     def test_fully_open_is_bit_identical(self, regularizer: gridreg.Regularizer) -> None:
         field = Planes(8)
@@ -235,7 +235,7 @@ class TestAttached:
     def test_a_compiled_field_follows_the_step(self) -> None:
         field = Planes(8)
         handle = gridreg.apply(
-            field, FourierLowPass(PLANES, Linear(0.1, 1.0)), SpatialAnnealing(LINES, until=4), total_steps=10
+            field, FourierLowPass(PLANES, Linear(0.1, 1.0)), GridBlur(LINES, until=4), total_steps=10
         )
         compiled = torch.compile(field, backend="eager")
         for step in (0, 2, 5):
@@ -247,7 +247,7 @@ class TestAttached:
         handle = gridreg.apply(
             field,
             FourierLowPass(LINES, Linear(0.2, 1.0)),
-            SpatialAnnealing(PLANES, until=100, start=0.2, rounds=10, rate=1.0),
+            GridBlur(PLANES, until=100, start=0.2, rounds=10, rate=1.0),
             total_steps=100,
         )
         handle.step(50)
@@ -263,9 +263,9 @@ class TestAttached:
         [
             (FourierLowPass, {"keep": 1.5}, r"keep=1\.5"),
             (FourierLowPass, {"boundary": "zero"}, "boundary='zero'"),
-            (SpatialAnnealing, {"start": -1.0}, r"start=-1\.0"),
-            (SpatialAnnealing, {"rate": "fast"}, "rate='fast'"),
-            (SpatialAnnealing, {"until": -3}, "until=-3"),
+            (GridBlur, {"start": -1.0}, r"start=-1\.0"),
+            (GridBlur, {"rate": "fast"}, "rate='fast'"),
+            (GridBlur, {"until": -3}, "until=-3"),
         ],
     )
     def test_bad_arguments(self, cls: Any, arguments: dict[str, Any], message: str) -> None:

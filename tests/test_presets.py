@@ -158,7 +158,7 @@ def test_grid_rivals_differ_from_the_baseline_in_their_composition():
     assert sanerf.field == {**baseline.field, "decoder": "sh"}
     kinds = regularizers_of(sanerf)
     for site in ("density", "appearance"):
-        assert gridreg.SpatialAnnealing(site, until=0.8, start=0.15, rounds=30, rate=0.2) in kinds
+        assert gridreg.GridBlur(site, until=0.8, start=0.15, rounds=30, rate=0.2) in kinds
     assert gridreg.ViewDependenceMask("view", bands=2) in kinds
 
 

@@ -18,7 +18,7 @@ from gridreg.base import Clock, Context, Regularizer
 from gridreg.errors import InputError
 from gridreg.regularizers.patches import DepthSmoothness, RayKL, depth_smoothness, ray_kl
 from gridreg.regularizers.rays import (
-    Distortion,
+    DistortionLoss,
     OpacityEntropy,
     RayEntropy,
     distortion,
@@ -167,8 +167,8 @@ def test_ray_entropy_leaves_clear_rays_alone() -> None:
     [
         (OpacityEntropy(), opacity_entropy),
         (RayEntropy(threshold=0.3), lambda s: ray_entropy(s, 0.3)),
-        (Distortion(), distortion),
-        (Distortion(near=1.0, far=3.0), lambda s: distortion(s, 1.0, 3.0)),
+        (DistortionLoss(), distortion),
+        (DistortionLoss(near=1.0, far=3.0), lambda s: distortion(s, 1.0, 3.0)),
         (DepthSmoothness(), depth_smoothness),
         (RayKL(), ray_kl),
     ],
@@ -198,11 +198,11 @@ def test_bad_intervals(interval: tuple[float | None, float | None]) -> None:
     with pytest.raises(InputError, match="expected both with far beyond near"):
         distortion(make_batch(6, 1, 3).samples(), *interval)
     with pytest.raises(InputError, match="near="):
-        Distortion(near=interval[0], far=interval[1])
+        DistortionLoss(near=interval[0], far=interval[1])
 
 
 def test_bad_numbers() -> None:
-    for make in (OpacityEntropy, RayEntropy, Distortion, DepthSmoothness, RayKL):
+    for make in (OpacityEntropy, RayEntropy, DistortionLoss, DepthSmoothness, RayKL):
         with pytest.raises(InputError, match=r"weight=-1"):
             make(weight=-1)
     with pytest.raises(InputError, match=r"threshold=1\.5"):

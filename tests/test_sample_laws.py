@@ -77,7 +77,7 @@ seeds = st.integers(0, 10_000)
 
 def test_all_of_the_catalogue_take_part() -> None:
     names = {type(penalty).__name__ for penalty in penalties()}
-    assert names >= {"OcclusionLoss", "CauchySparsity", "OpacityEntropy", "RayEntropy", "Distortion"}
+    assert names >= {"OcclusionLoss", "CauchySparsity", "OpacityEntropy", "RayEntropy", "DistortionLoss"}
     assert names >= {"DepthSmoothness", "RayKL"}
 
 

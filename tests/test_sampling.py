@@ -16,7 +16,7 @@ from gridreg.errors import InputError
 from gridreg.regularizers.backgrounds import (
     ExpectedBackground,
     RandomBackground,
-    SpaceAnnealing,
+    SampleSpaceAnnealing,
     anneal_space,
     opacity_error,
     random_background,
@@ -139,7 +139,7 @@ class TestExpectedBackground:
             ExpectedBackground(weight=-1.0)
 
 
-class TestSpaceAnnealing:
+class TestSampleSpaceAnnealing:
     @given(st.floats(0, 5), st.floats(0.1, 5), st.floats(0, 1.2), st.floats(0, 1), st.floats(0, 1))
     def test_matches_regnerf(
         self, near: float, length: float, progress: float, start: float, middle: float
@@ -153,7 +153,7 @@ class TestSpaceAnnealing:
         assert begin - 1e-9 <= found[0] <= found[1] + 1e-9 <= end + 2e-9
 
     def test_opens_with_the_step_and_ends_with_the_very_tensors(self) -> None:
-        regularizer = SpaceAnnealing(until=50, start=0.2)
+        regularizer = SampleSpaceAnnealing(until=50, start=0.2)
         near, far = torch.full((3,), 2.0), torch.full((3,), 6.0)
         lengths = []
         for step in (0, 10, 20, 49):
@@ -169,7 +169,7 @@ class TestSpaceAnnealing:
     @pytest.mark.parametrize("arguments", [{"start": 1.5}, {"middle": -0.1}, {"until": -1}])
     def test_bad_arguments(self, arguments: dict[str, Any]) -> None:
         with pytest.raises(InputError, match=next(iter(arguments))):
-            SpaceAnnealing(**arguments)
+            SampleSpaceAnnealing(**arguments)
 
 
 def colour_loss(samples: RaySamples) -> Tensor:

@@ -80,11 +80,11 @@ def pictures() -> dict[str, str]:
         (boundary, filtered(gridreg.FourierLowPass(grid, 0.1, boundary), 0))
         for boundary in ("periodic", "mirror")
     ]
-    annealing = gridreg.SpatialAnnealing(grid, until=100)
+    annealing = gridreg.GridBlur(grid, until=100)
     blurred = [(f"at {step} %", filtered(annealing, step)) for step in (0, 60)]
     steps = np.linspace(0, 1, 601)
     panel = Panel(
-        "Radius of SpatialAnnealing(until=0.3)",
+        "Radius of GridBlur(until=0.3)",
         x=(0, 0.4), y=(0, 0.16), x_label="share of the run", y_label="share of the edge",
         x_ticks=(0, 0.1, 0.2, 0.3, 0.4), y_ticks=(0, 0.05, 0.1, 0.15),
     )  # fmt: skip
@@ -94,5 +94,5 @@ def pictures() -> dict[str, str]:
         "filter-fourier": lines("A line seen through FourierLowPass", fourier),
         "filter-borders": lines("keep=0.1 with both boundaries", borders),
         "filter-radius": panel.svg(),
-        "filter-blur": lines("A line seen through SpatialAnnealing", blurred),
+        "filter-blur": lines("A line seen through GridBlur", blurred),
     }

@@ -102,7 +102,7 @@ def distortion() -> str:
         return gridreg.distortion(RaySamples.from_dense(t, 0 * t + 0.1, half, half))
 
     panel = Panel(
-        "Distortion of two lumps on a ray",
+        "DistortionLoss of two lumps on a ray",
         x=(0, 2), y=(0, 1.1), x_label="distance between them, world units", x_ticks=(0, 0.5, 1, 1.5, 2),
         y_ticks=(0, 0.5, 1),
     )  # fmt: skip

@@ -51,13 +51,13 @@ def annealed_interval() -> str:
     steps = np.arange(0, 401, 4)
     near, far = torch.tensor([2.0]), torch.tensor([6.0])
     rows = []
-    with gridreg.apply(nn.Linear(1, 1), gridreg.SpaceAnnealing(), total_steps=TOTAL) as handle:
+    with gridreg.apply(nn.Linear(1, 1), gridreg.SampleSpaceAnnealing(), total_steps=TOTAL) as handle:
         for step in steps.tolist():
             handle.step(step)
             rows.append([float(end) for end in handle.near_far(near, far)])
     low, high = np.array(rows).T
     panel = Panel(
-        "SpaceAnnealing() between near 2 and far 6",
+        "SampleSpaceAnnealing() between near 2 and far 6",
         x=(0, 400), y=(1.5, 6.5), x_label="step", y_label="world units", x_ticks=(0, 128, 256, 400), y_ticks=(2, 4, 6),
     )  # fmt: skip
     panel.area(steps, low, high)

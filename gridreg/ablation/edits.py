@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
 from typing import Any
 
 from gridreg.base import REGISTRY
-from gridreg.compositions.named import composition, composition_names
+from gridreg.compositions.named import RETIRED, composition, composition_names
 from gridreg.compositions.plain_data import from_config, to_config
-from gridreg.errors import InputError
+from gridreg.errors import InputError, near_names
 from gridreg.training.presets import load_preset, preset_names
 
 __all__ = [
@@ -39,8 +38,7 @@ def refuse_unknown(found: Mapping[str, Any], valid: Sequence[str], what: str) ->
     """
     for key in found:
         if key not in valid:
-            near = difflib.get_close_matches(str(key), valid, n=1, cutoff=0.5)
-            hint = f", did you mean {near[0]!r}?" if near else ";"
+            hint = near_names(key, valid) or ";"
             raise InputError(f"{what}: unknown key {key!r}{hint} valid: {', '.join(valid)}")
 
 
@@ -64,18 +62,30 @@ def normalised(entries: Any) -> Plain:
 def known_composition(name: str) -> Plain:
     """A composition by its name, or by the name of the preset that holds it.
 
+    Args:
+        name: ``NAME``, or where a composition and a preset of one name differ, ``composition:NAME`` or ``preset:NAME``.
+
     Raises:
-        InputError: if there is neither, with the names there are.
+        InputError: if there is neither, with the names there are, or if both are there and differ.
     """
-    if name in composition_names():
-        return to_config(composition(name))
-    if name in preset_names():
-        held = load_preset(name).composition
-        return to_config(composition(held)) if isinstance(held, str) else normalised(held)
-    valid = [*composition_names(), *(n for n in preset_names() if n not in composition_names())]
-    near = difflib.get_close_matches(name, valid, n=1, cutoff=0.5)
-    hint = f"; did you mean {near[0]!r}?" if near else ""
-    raise InputError(f"unknown composition {name!r}, expected one of {', '.join(valid)}{hint}")
+    kind, _, bare = name.rpartition(":")
+    found: list[Plain] = []
+    if kind == "composition" or (not kind and bare in (*composition_names(), *RETIRED)):
+        found.append(to_config(composition(bare)))
+    if kind == "preset" or (not kind and bare in preset_names()):
+        held = load_preset(bare).composition
+        found.append(to_config(composition(held)) if isinstance(held, str) else normalised(held))
+    if len(found) == 2 and found[0] != found[1]:
+        raise InputError(
+            f"composition {name!r}: a composition and a preset have this name and differ; "
+            f"write composition:{bare} or preset:{bare}"
+        )
+    if not found:
+        valid = sorted({*composition_names(), *preset_names()})
+        raise InputError(
+            f"unknown composition {name!r}, expected one of {', '.join(valid)}{near_names(name, valid)}"
+        )
+    return found[0]
 
 
 def title_of(regularizer: Mapping[str, Any]) -> str:
@@ -224,10 +234,7 @@ def _selector(selector: Any) -> tuple[str | None, str | None]:
     else:
         raise InputError(f"found {selector!r}, expected NAME, NAME SITE or {{name: NAME, site: SITE}}")
     if found[0] is not None and found[0] not in REGISTRY:
-        near = difflib.get_close_matches(str(found[0]), sorted(REGISTRY), n=1, cutoff=0.5)
-        raise InputError(
-            f"unknown regularizer {found[0]!r}" + (f", did you mean {near[0]!r}?" if near else "")
-        )
+        raise InputError(f"unknown regularizer {found[0]!r}{near_names(found[0], sorted(REGISTRY))}")
     return found
 
 

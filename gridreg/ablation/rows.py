@@ -139,7 +139,7 @@ def _plain_row(entry: Any) -> Row:
     if not isinstance(name, str):
         raise InputError(f"name: found {name!r}, expected the name of a composition")
     edits = {key: entry[key] for key in _EDITS if key in entry}
-    label = label or name + "".join(_edit_titles(edits))
+    label = label or name.rpartition(":")[2] + "".join(_edit_titles(edits))
     if name == "preset":
         return Row(label, None, edits)
     return Row(label, _edited(known_composition(name), edits))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import fnmatch
 import inspect
 import re
@@ -13,7 +12,7 @@ from typing import Literal, TypeAlias
 from torch import Tensor, nn
 
 from gridreg.attach.sites import Grid, Place, Selector, Site, SiteLike
-from gridreg.errors import InputError
+from gridreg.errors import InputError, near_names
 
 __all__ = ["Match", "find", "raw_tensor", "register_adapter", "sites_of"]
 
@@ -130,10 +129,7 @@ def find(field: nn.Module, site: SiteLike, part: Literal["mask", "grids"]) -> li
 
 def _unknown(name: str, names: Sequence[str], reason: str) -> str:
     """One line: what was asked, the near names, all names."""
-    near = difflib.get_close_matches(name, names, n=3, cutoff=0.5)
-    text = f"site {name!r}: {reason}"
-    if near:
-        text += f"; did you mean {', '.join(repr(n) for n in near)}?"
+    text = f"site {name!r}: {reason}{near_names(name, names, 3)}"
     shown = ", ".join(repr(n) for n in names[:20]) + (", ..." if len(names) > 20 else "")
     return text + (
         f" Names: {shown}" if names else " There are none; use gridreg.parameters, outputs or inputs"

@@ -5,7 +5,6 @@ Each command is a module with a dataclass of options, which tyro turns into ``--
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import sys
 from collections.abc import Sequence
@@ -14,7 +13,7 @@ from importlib import metadata
 from typing import Annotated, Any, Union
 
 from gridreg.cli.exit_status import run_cli
-from gridreg.errors import InputError
+from gridreg.errors import InputError, near_names
 
 __all__ = ["COMMANDS", "Command", "main", "options_of"]
 
@@ -84,9 +83,8 @@ def _main(words: list[str]) -> int:
         return _completion(words)
     name, rest = words[0], words[1:]
     if name not in COMMANDS:
-        near = difflib.get_close_matches(name, COMMANDS, n=1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
-        raise InputError(f"command: found {name!r}, expected one of {', '.join(COMMANDS)}{hint}")
+        known = ", ".join(COMMANDS)
+        raise InputError(f"command: found {name!r}, expected one of {known}{near_names(name, COMMANDS)}")
     run = _load(COMMANDS[name].run)
     if name == "bench":
         # What follows the name of a benchmark is the benchmark's own.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import MISSING, fields
@@ -11,7 +10,7 @@ from typing import Any
 from gridreg.attach.handle import Handle
 from gridreg.attach.sites import Selector, Site, inputs, outputs, parameters
 from gridreg.base import REGISTRY, Regularizer
-from gridreg.errors import InputError
+from gridreg.errors import InputError, near_names
 from gridreg.schedules import SCHEDULES, Schedule
 
 __all__ = ["from_config", "to_config"]
@@ -183,6 +182,4 @@ def _lookup(kind: str, name: Any, known: Mapping[str, Any]) -> Any:
 
 def _unknown(kind: str, name: str, valid: Sequence[str]) -> str:
     """One line: what was found, the nearest, all valid ones."""
-    near = difflib.get_close_matches(name, valid, n=1, cutoff=0.5)
-    hint = f"; did you mean {near[0]!r}?" if near else ";"
-    return f"unknown {kind} {name!r}{hint} valid: {', '.join(valid)}"
+    return f"unknown {kind} {name!r}{near_names(name, valid) or ';'} valid: {', '.join(valid)}"

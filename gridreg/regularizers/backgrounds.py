@@ -17,7 +17,7 @@ from gridreg.schedules import Numeric, check_numeric
 __all__ = [
     "ExpectedBackground",
     "RandomBackground",
-    "SpaceAnnealing",
+    "SampleSpaceAnnealing",
     "anneal_space",
     "opacity_error",
     "random_background",
@@ -227,7 +227,7 @@ class ExpectedBackground(Regularizer):
 
 @register
 @dataclass(frozen=True)
-class SpaceAnnealing(Regularizer):
+class SampleSpaceAnnealing(Regularizer):
     """Rays are sampled only around their middle at first, then wider: see `anneal_space`.
 
     Args:
@@ -244,7 +244,7 @@ class SpaceAnnealing(Regularizer):
         InputError: a number is out of range.
 
     Example:
-        >>> SpaceAnnealing().until
+        >>> SampleSpaceAnnealing().until
         256
     """
 

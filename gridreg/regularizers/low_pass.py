@@ -16,7 +16,7 @@ from gridreg.errors import InputError
 from gridreg.regularizers.filters import Boundary, fourier_low_pass, gaussian_blur
 from gridreg.schedules import Linear, Numeric, check_numeric
 
-__all__ = ["FourierLowPass", "SpatialAnnealing", "annealed_radius"]
+__all__ = ["FourierLowPass", "GridBlur", "annealed_radius"]
 
 _FOURIERF_KEEP = Linear(0.3, 1.0, until=2000)
 
@@ -152,7 +152,7 @@ class FourierLowPass(_GridFilter):
 
 @register
 @dataclass(frozen=True)
-class SpatialAnnealing(_GridFilter):
+class GridBlur(_GridFilter):
     """The field sees its grids blurred, less and less: see `annealed_radius` and `gaussian_blur`.
 
     SANeRF widens the footprint of its samples on mip-mapped planes; for a field without mip-maps a blur of
@@ -174,7 +174,7 @@ class SpatialAnnealing(_GridFilter):
         InputError: a number is out of range, or a grid has no spatial axes.
 
     Example:
-        >>> SpatialAnnealing("density", until=0.3).start
+        >>> GridBlur("density", until=0.3).start
         0.15
     """
 

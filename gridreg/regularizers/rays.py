@@ -17,7 +17,7 @@ from gridreg.schedules import Numeric, check_numeric
 from gridreg.segments import before_less_behind
 
 __all__ = [
-    "Distortion",
+    "DistortionLoss",
     "OpacityEntropy",
     "RayEntropy",
     "distortion",
@@ -225,7 +225,7 @@ class RayEntropy(Regularizer):
 
 @register
 @dataclass(frozen=True)
-class Distortion(Regularizer):
+class DistortionLoss(Regularizer):
     """Weight spread along a ray is penalised: see `distortion`.
 
     Args:
@@ -241,7 +241,7 @@ class Distortion(Regularizer):
         InputError: a number is out of range, only one of near and far is given, or far is not beyond near.
 
     Example:
-        >>> Distortion(near=2.0, far=6.0).far
+        >>> DistortionLoss(near=2.0, far=6.0).far
         6.0
     """
 

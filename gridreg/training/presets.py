@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import difflib
 from pathlib import Path
 
-from gridreg.errors import InputError
+from gridreg.errors import InputError, near_names
 from gridreg.training.config import from_yaml
 from gridreg.training.settings import RunConfig
 
@@ -31,8 +30,8 @@ def load_preset(name: str) -> RunConfig:
     """
     names = preset_names()
     if name not in names:
-        near = difflib.get_close_matches(name, names, n=1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
-        raise InputError(f"preset: found {name!r}, expected one of {', '.join(names)}{hint}")
+        raise InputError(
+            f"preset: found {name!r}, expected one of {', '.join(names)}{near_names(name, names)}"
+        )
     config = from_yaml(_folder() / f"{name}.yaml", RunConfig)
     return RunConfig(**{**config.__dict__, "preset": name})
