@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+import gridreg.errors
 from tests.inventory import inventory
 
 BEFORE: dict[str, list[str]] = json.loads(
@@ -14,6 +15,10 @@ BEFORE: dict[str, list[str]] = json.loads(
 )
 #: Old name: new name, by kind. Tests beside the code show that the old one is refused and the new one named.
 RENAMED: dict[str, dict[str, str]] = {
+    "public": gridreg.errors.RENAMED,
+    "regularizers": gridreg.errors.RENAMED,
+    # Another name of the same regularizers.
+    "compositions": {"few_tensorf_finetuned": "few_tensorf"},
     # A positional argument, whose name is only shown.
     "options": {"prepare.pictures": "prepare.images"},
 }
