@@ -63,7 +63,7 @@ class CPField(TensorialField):
 
     def _marched(
         self, march: ops.MarchArguments, activation: ops.Activation, transmittance_bound: float
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    ) -> ops.RayMarchResult:
         opened = _open_components(self.density_lines)
         return ops.cp_march_density(march, activation, transmittance_bound, list(self.density_lines), opened)
 

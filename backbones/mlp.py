@@ -14,7 +14,6 @@ from backbones.tensorial import density_shift_for
 from gridreg import ops
 from gridreg.attach.sites import Site, parameters
 from gridreg.encodings import octaves_of_channels
-from gridreg.ops import rays as backends
 from gridreg.ops.cpu.adam.optimizer import FusedAdam
 from gridreg.ops.linear import Precision
 from gridreg.rendering import OccupancyGrid, RayMarchResult, Rays
@@ -229,7 +228,7 @@ class MLPField(nn.Module):
         depth[kept] = self.density(positions[kept])
         depth *= edges.diff(dim=1)
         offsets = torch.arange(len(rays) + 1, device=coarse.device) * self.coarse_samples
-        weights = backends.composite_weights(depth.reshape(-1), offsets).reshape(coarse.shape)
+        weights = ops.composite_weights(depth.reshape(-1), offsets).reshape(coarse.shape)
         fine = inverse_transform(edges, weights, self.fine_samples, jitter)
         return torch.cat([coarse, fine], dim=1).sort(dim=1).values
 

@@ -15,7 +15,7 @@ from backbones.decoders import Basis, make_decoder
 from gridreg import ops
 from gridreg.attach.sites import Site
 from gridreg.ops.cpu.adam.optimizer import FusedAdam
-from gridreg.rendering import OccupancyGrid, RayMarchResult, Rays
+from gridreg.rendering import OccupancyGrid, Rays
 
 __all__ = ["TensorialField", "density_shift_for"]
 
@@ -76,8 +76,8 @@ class TensorialField(nn.Module):
         """A subclass with a density of its own is marched through that density, unless it brings its own march."""
         super().__init_subclass__(**options)
         own = {"density", "density_features", "activate", "normalise"} & cls.__dict__.keys()
-        if own and not {"march_density", "_marched"} & cls.__dict__.keys():
-            cls.march_density = None  # type: ignore[assignment]
+        if own and "_marched" not in cls.__dict__:
+            cls._marched = TensorialField._marched  # type: ignore[method-assign]
 
     def __init__(
         self,
@@ -148,8 +148,8 @@ class TensorialField(nn.Module):
         occupancy: OccupancyGrid,
         jitter: Tensor,
         transmittance_bound: float,
-    ) -> RayMarchResult:
-        """March, density and early termination in one: see `gridreg.rendering.MarchSettings` and `RayMarchResult`.
+    ) -> ops.RayMarchResult:
+        """March, density and early termination in one: see `gridreg.ops.RayMarchResult`.
 
         Args:
             rays: ``R`` rays.
@@ -163,12 +163,13 @@ class TensorialField(nn.Module):
             rays.origins, rays.directions, t_min, t_max, step, occupancy.cells, occupancy.bounds, jitter
         )
         activation = ops.Activation(self.bounds, self.density_shift, self.distance_scale)
-        return RayMarchResult(*self._marched(march, activation, transmittance_bound))
+        return self._marched(march, activation, transmittance_bound)
 
     def _marched(
         self, march: ops.MarchArguments, activation: ops.Activation, transmittance_bound: float
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        raise TypeError(f"{type(self).__name__} must define _marched")
+    ) -> ops.RayMarchResult:
+        """The samples kept; subclasses evaluate their own grids while they march."""
+        return ops.march_density(march, self.density, transmittance_bound)
 
     def colour(self, x: Tensor, d: Tensor) -> Tensor:
         """Colour ``(N, 3)`` at world positions ``(N, 3)`` seen along unit directions ``(N, 3)``."""
@@ -238,12 +239,12 @@ class TensorialField(nn.Module):
         """
         return FusedAdam(groups, betas=betas)
 
-    def gradient_context(self, faint: float = 0.0) -> AbstractContextManager[None]:
+    def gradient_context(self, rounding: float = 0.0) -> AbstractContextManager[None]:
         """Around a trainer's backward pass: gradients of planes are added to buffers that stay.
 
-        ``faint``: see `gridreg.ops.accumulate_into_grad`.
+        ``rounding``: see `gridreg.ops.accumulate_into_grad`.
         """
-        return ops.accumulate_into_grad(faint)
+        return ops.accumulate_into_grad(rounding)
 
     def sites(self) -> dict[str, Site]:
         """The encodings of the decoder; subclasses add their grids."""

@@ -74,7 +74,7 @@ class VMField(TensorialField):
 
     def _marched(
         self, march: ops.MarchArguments, activation: ops.Activation, transmittance_bound: float
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    ) -> ops.RayMarchResult:
         opened = _open_components(self.density_planes, self.density_lines)
         return ops.vm_march_density(
             march,

@@ -22,7 +22,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from speed.whole_run import Spans
 
 from gridreg.cli import run_cli
-from gridreg.ops.rays import use_backend
+from gridreg.ops import use_backend
 from gridreg.training import StepReport, configure, execute, open_scene
 from gridreg.training.checkpoint import has_checkpoint
 from gridreg.training.files import write_json

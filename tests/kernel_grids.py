@@ -9,7 +9,7 @@ import torch
 from hypothesis import strategies as st
 from scipy import ndimage
 
-from gridreg.ops.rays import use_backend
+from gridreg.ops import use_backend
 
 PLANE_AXES = ((0, 1), (0, 2), (1, 2))
 LINE_AXES = (2, 1, 0)

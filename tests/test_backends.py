@@ -1,8 +1,10 @@
-"""The plain inner loops against loops written from their formulas, and the choice between backends."""
+"""The plain operations against loops written from their formulas, and the choice between versions."""
 
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -10,30 +12,24 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gridreg import ops
 from gridreg.errors import InputError
-from gridreg.ops import dispatch as choice
-from gridreg.ops import ray_reference as plain
-from gridreg.ops.rays import (
-    Backend,
-    accumulate,
-    chosen_backend,
-    composite_weights,
-    march,
-    register_backend,
-    registered_backends,
-    takes_compiled,
-    terminate,
-    use_backend,
-)
+from gridreg.ops import composite, dispatch, ray_marching
+from gridreg.ops.dispatch import chosen_backend, is_cpu_float32, operation, use_backend
+
+accumulate, composite_weights, terminate = ops.accumulate, ops.composite_weights, ops.terminate
 
 F = np.float32
 
 
 @pytest.fixture(autouse=True)
 def _plain_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    """These tests see the plain versions, whatever was imported before them."""
-    monkeypatch.setattr(choice, "_BACKENDS", {"torch": choice._BACKENDS["torch"]})
-    monkeypatch.setattr(choice, "_choice", "auto")
+    """These tests see the plain versions."""
+    monkeypatch.setattr(dispatch, "_choice", "torch")
+
+
+def march(*arguments, **named):
+    return ops.march(ops.MarchArguments(*arguments, **named))
 
 
 def march_by_hand(o, d, t_min, t_max, step, cells, bounds, jitter):
@@ -106,7 +102,7 @@ class TestMarch:
     def test_blocks_do_not_matter(self, monkeypatch):
         o, d, t_min, t_max, cells, bounds, jitter = random_rays(3, 40, (4, 5, 6), 0.5)
         whole = march(o, d, t_min, t_max, 0.1, cells, bounds, jitter)
-        monkeypatch.setattr(plain, "_BLOCK", 100)
+        monkeypatch.setattr(ray_marching, "_BLOCK", 100)
         for a, b in zip(whole, march(o, d, t_min, t_max, 0.1, cells, bounds, jitter), strict=True):
             assert torch.equal(a, b)
 
@@ -195,7 +191,7 @@ class TestCompositing:
     def test_blocks_do_not_matter(self, monkeypatch):
         tau, offsets = random_packed(8, [3, 0, 9, 1, 4, 0])
         whole = composite_weights(tau, offsets)
-        monkeypatch.setattr(plain, "_BLOCK", 5)
+        monkeypatch.setattr(composite, "_BLOCK", 5)
         assert torch.equal(whole, composite_weights(tau, offsets))
 
     def test_termination_changes_a_colour_by_less_than_the_bound(self):
@@ -222,14 +218,12 @@ class TestCompositing:
 
 
 class TestChoice:
-    def test_names(self):
-        assert registered_backends() == ("torch",)
+    def test_names(self, monkeypatch):
         with pytest.raises(InputError, match="expected one of auto, compiled, torch"):
             use_backend("cuda")
-        with pytest.raises(InputError, match="import backbones"):
+        monkeypatch.setattr(dispatch, "_compiled", set())
+        with pytest.raises(InputError, match="numba is not installed"):
             use_backend("compiled")
-        with pytest.raises(InputError, match="'torch'"):
-            register_backend("torch", choice._TORCH)
 
     def test_function_and_context(self):
         use_backend("torch")
@@ -241,24 +235,69 @@ class TestChoice:
             raise RuntimeError("inside")
         assert chosen_backend() == "torch"
 
-    def test_dispatch_follows_choice_and_dtype(self):
-        calls = []
+    def test_the_version_follows_choice_and_tensors(self, monkeypatch):
+        monkeypatch.setattr(dispatch, "_compiled", set())
 
-        def compiled(tau, offsets):
-            calls.append(tau.dtype)
-            return plain.composite_weights(tau, offsets)
+        def check(x, others=()):
+            if x.dim() != 1:
+                raise InputError("x: expected one axis")
 
-        tau, offsets = random_packed(2, [2, 3])
-        composite_weights(tau.float(), offsets)
-        assert calls == []
-        register_backend("compiled", Backend(plain.march, compiled, plain.accumulate, plain.terminate))
-        for name in ("auto", "compiled", "torch"):
+        @operation(check=check)
+        def version(x, others=()):
+            """Which ran."""
+            return "plain"
+
+        assert version.__doc__ == "Which ran."
+        assert version.__module__ == __name__
+        with use_backend("auto"):
+            assert version(torch.zeros(1)) == "plain"
+
+        @version.register_cpu()
+        def compiled(x, others=()):
+            return "compiled"
+
+        x = torch.zeros(3)
+        for name, expected in (("auto", "compiled"), ("compiled", "compiled"), ("torch", "plain")):
             with use_backend(name):
-                composite_weights(tau.float(), offsets)
-                composite_weights(tau, offsets)
-        assert calls == [torch.float32] * 2
-        assert takes_compiled(tau.float())
-        with use_backend("torch"):
-            assert not takes_compiled(tau.float())
-        assert not takes_compiled(tau.float(), tau)
-        assert not takes_compiled(tau.float().to("meta"))
+                assert version(x) == expected
+                assert (
+                    version(x.double()) == version(x, others=[x.double()]) == version(x.to("meta")) == "plain"
+                )
+                assert version(x, others=[torch.zeros(2, dtype=torch.int64)]) == expected
+                with pytest.raises(InputError, match="one axis"):
+                    version(x[None])
+        version.register_cpu(suits=lambda x, others=(): len(x) > 3)(compiled)
+        with use_backend("auto"):
+            assert (version(x), version(torch.zeros(4))) == ("plain", "compiled")
+
+    def test_what_suits_compiled_code(self):
+        x = torch.zeros(2)
+        assert is_cpu_float32(x, (x, [x]), torch.zeros(1, dtype=torch.uint8), 1.0, None, flag=True)
+        assert not is_cpu_float32(x, (x, [x.double()]))
+        assert not is_cpu_float32(x, named=x.half())
+        assert not is_cpu_float32(torch.zeros(1, dtype=torch.int64, device="meta"))
+        assert not is_cpu_float32(torch.zeros(1, dtype=torch.uint8).expand(2**31))
+
+    def test_a_field_of_ones_own_is_marched_and_composited_by_compiled_code(self):
+        """Registration comes with `gridreg.rendering`; nothing else has to be imported."""
+        code = """if True:
+            import torch
+            from gridreg import rendering
+            class Ball:
+                bounds = torch.tensor([[-1.0] * 3, [1.0] * 3])
+                def density(self, x):
+                    return torch.where(x.norm(dim=-1) < 0.5, 20.0, 0.0)
+                def colour(self, x, d):
+                    return x * 0 + 0.5
+            rays = rendering.Rays(torch.tensor([[-3.0, 0.0, 0.0]]), torch.tensor([[1.0, 0.0, 0.0]]))
+            grid = rendering.OccupancyGrid.full(Ball.bounds, (4, 4, 4))
+            from gridreg import ops
+            for one in (ops.march, ops.composite_weights, ops.terminate, ops.merge_samples, ops.pixels):
+                def refuse(*arguments, **named):
+                    raise AssertionError("plain")
+                one.reference = refuse
+            out = rendering.render_rays(Ball(), rays, grid, rendering.MarchSettings(0.01), background=torch.ones(3))
+            print(round(float(out.colour[0, 0]), 3))
+        """
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+        assert done.stdout.strip() == "0.5", done.stderr

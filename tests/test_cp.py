@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 
 import gridreg
 from backbones.cp import LINE_AXES, CPField
+from gridreg import ops
 from gridreg.fields import make_field
-from gridreg.ops import grid_reference as reference
-from gridreg.ops.rays import use_backend
+from gridreg.ops import use_backend
 from gridreg.rendering import MarchSettings, OccupancyGrid, Rays, render_rays
 
 BOX = torch.tensor([[-1.0, -2.0, 0.0], [1.0, 1.0, 3.0]])
@@ -94,7 +94,7 @@ def test_the_same_seed_gives_the_same_lines():
 def test_a_mask_enters_once_though_three_lines_multiply(kind, step):
     field = small(appearance_components=6)
     u = nodes(field)
-    products = reference.cp_features(u, list(getattr(field, f"{kind}_lines")))
+    products = ops.cp_features.reference(u, list(getattr(field, f"{kind}_lines")))
     mask = gridreg.frequency_mask(6, step, 90)
     with gridreg.apply(field, gridreg.FrequencyMask(kind, until=90), total_steps=100) as handle:
         handle.step(step)
@@ -159,7 +159,7 @@ def test_masks_go_on_over_a_resampling():
         with handle.suspended():
             field.resample((9, 9, 9))
         handle.step(1)
-        products = reference.cp_features(nodes(field), list(field.density_lines))
+        products = ops.cp_features.reference(nodes(field), list(field.density_lines))
         torch.testing.assert_close(
             field.density_features(nodes(field)), products[:, :3].sum(1), atol=1e-5, rtol=1e-5
         )
@@ -218,8 +218,8 @@ def test_colour_by_ray_is_colour_by_sample():
 def test_gradients_of_lines_are_those_of_finite_differences():
     lines = [torch.rand(4, 2, dtype=torch.float64, requires_grad=True) for _ in range(3)]
     u = torch.rand(5, 3, dtype=torch.float64)
-    assert torch.autograd.gradcheck(lambda *grids: reference.cp_density(u, grids), lines)
-    assert torch.autograd.gradcheck(lambda *grids: reference.cp_features(u, grids), lines)
+    assert torch.autograd.gradcheck(lambda *grids: ops.cp_density.reference(u, grids), lines)
+    assert torch.autograd.gradcheck(lambda *grids: ops.cp_features.reference(u, grids), lines)
 
 
 @pytest.mark.parametrize("visible", [1.0, 0.5])

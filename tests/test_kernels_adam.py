@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gridreg.base import LocalTerm
+from gridreg.ops import use_backend
 from gridreg.ops.cpu.adam import optimizer as adam
 from gridreg.ops.cpu.adam import update as adam_update
 from gridreg.ops.cpu.adam.layout import Layout, layout
 from gridreg.ops.cpu.adam.optimizer import FusedAdam
-from gridreg.ops.rays import use_backend
 
 BETAS = (0.9, 0.99)
 

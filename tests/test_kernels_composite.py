@@ -10,9 +10,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gridreg.ops import dispatch as choice
-from gridreg.ops import ray_reference as plain
-from gridreg.ops import rays as backends
+from gridreg import ops
+from gridreg.ops.composite import _depth_before
 from gridreg.ops.cpu import composite
 
 counts_lists = st.lists(st.sampled_from([0, 0, 1, 2, 7, 40]), max_size=150)
@@ -37,7 +36,10 @@ def test_weights(counts, seed):
     tau, _, offsets = random_packed(seed, counts)
     tau.requires_grad_()
     exact = tau.detach().double().requires_grad_()
-    found, expected = composite.composite_weights(tau, offsets), plain.composite_weights(exact, offsets)
+    found, expected = (
+        composite.composite_weights(tau, offsets),
+        ops.composite_weights.reference(exact, offsets),
+    )
     torch.testing.assert_close(found, expected.float(), rtol=1e-5, atol=1e-12)
     (a,), (b,) = gradients(found, (tau,), seed), gradients(expected, (exact,), seed)
     torch.testing.assert_close(a, b.float(), rtol=1e-4, atol=1e-5)
@@ -50,9 +52,9 @@ def test_pixels(counts, seed):
     g = torch.Generator().manual_seed(seed)
     t, background = torch.rand(len(weights), generator=g), torch.rand(len(counts), 3, generator=g)
     results = []
-    for module, kind in ((composite, torch.float32), (plain, torch.float64)):
+    for pixels, kind in ((composite.pixels, torch.float32), (ops.pixels.reference, torch.float64)):
         given_ = [x.to(kind).requires_grad_() for x in (weights.clone(), colours.clone())]
-        out = module.pixels(*given_, t.to(kind), background.to(kind), offsets)
+        out = pixels(*given_, t.to(kind), background.to(kind), offsets)
         results.append([*out, *gradients(torch.cat([x.reshape(-1) for x in out]), given_, seed)])
     for a, b in zip(*results, strict=True):
         torch.testing.assert_close(a, b.float(), rtol=1e-5, atol=1e-5)
@@ -63,8 +65,8 @@ def test_distances_and_backgrounds_may_need_gradients(place):
     weights, colours, offsets = random_packed(1, [3, 0, 4])
     given_ = [weights, colours, torch.rand(7), torch.rand(3, 3)]
     given_[place].requires_grad_()
-    found = torch.cat([x.reshape(-1) for x in composite.pixels(*given_, offsets)])
-    expected = torch.cat([x.reshape(-1) for x in plain.pixels(*given_, offsets)])
+    found = torch.cat([x.reshape(-1) for x in ops.pixels(*given_, offsets)])
+    expected = torch.cat([x.reshape(-1) for x in ops.pixels.reference(*given_, offsets)])
     torch.testing.assert_close(
         *(gradients(x, (given_[place],), 0)[0] for x in (found, expected)), rtol=1e-5, atol=1e-6
     )
@@ -78,7 +80,7 @@ def test_sums(counts, seed, channels):
     values.requires_grad_()
     found, expected = (
         composite.accumulate(weights, values, offsets),
-        plain.accumulate(weights, values, offsets),
+        ops.accumulate.reference(weights, values, offsets),
     )
     torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
     for a, b in zip(
@@ -91,9 +93,9 @@ def test_sums(counts, seed, channels):
 @given(counts=counts_lists, seed=st.integers(0, 2**31), bound=st.sampled_from([0.0, 1e-4, 0.013, 0.5, 1.0]))
 def test_terminate(counts, seed, bound):
     tau, _, offsets = random_packed(seed, counts)
-    found, expected = composite.terminate(tau, offsets, bound), plain.terminate(tau, offsets, bound)
+    found, expected = composite.terminate(tau, offsets, bound), ops.terminate.reference(tau, offsets, bound)
     assert found.dtype == torch.bool
-    before = torch.exp(-plain._depth_before(tau.double(), offsets))
+    before = torch.exp(-_depth_before(tau.double(), offsets))
     undecided = (before - bound).abs() <= 1e-5 * bound
     assert torch.equal(found | undecided, expected | undecided)
     assert bool(found.all()) or bound > 0
@@ -104,7 +106,7 @@ def test_only_the_wanted_gradient():
     for wanted in (weights, values):
         wanted.requires_grad_()
         (found,) = gradients(composite.accumulate(weights, values, offsets), (wanted,), 0)
-        (expected,) = gradients(plain.accumulate(weights, values, offsets), (wanted,), 0)
+        (expected,) = gradients(ops.accumulate.reference(weights, values, offsets), (wanted,), 0)
         torch.testing.assert_close(found, expected)
         wanted.requires_grad_(False)
     assert not composite.accumulate(weights, values, offsets).requires_grad
@@ -113,12 +115,12 @@ def test_only_the_wanted_gradient():
 def test_opaque_and_strided():
     tau = torch.tensor([[0.5, 9.0], [math.inf, 9.0], [1.0, 9.0], [2.0, 9.0]])[:, 0].requires_grad_()
     offsets = torch.tensor([[0, 0], [3, 0], [4, 0]])[:, 0]
-    found, expected = composite.composite_weights(tau, offsets), plain.composite_weights(tau, offsets)
+    found, expected = composite.composite_weights(tau, offsets), ops.composite_weights.reference(tau, offsets)
     torch.testing.assert_close(found, expected)
     torch.testing.assert_close(gradients(found, (tau,), 0), gradients(expected, (tau,), 0))
     spread = torch.ones(1, 1).expand(4, 3)
     torch.testing.assert_close(
-        composite.accumulate(found, spread, offsets), plain.accumulate(expected, spread, offsets)
+        composite.accumulate(found, spread, offsets), ops.accumulate.reference(expected, spread, offsets)
     )
 
 
@@ -164,15 +166,14 @@ def test_two_python_threads_at_once():
         assert all(torch.equal(found, expected) for found in pool.map(work, range(60)))
 
 
-def test_register(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(choice, "_BACKENDS", {"torch": choice._BACKENDS["torch"]})
-    composite.register()
+def test_registered():
     tau, values, offsets = random_packed(7, [5, 0, 9])
-    weights = backends.composite_weights(tau, offsets)
+    weights = ops.composite_weights(tau, offsets)
     assert torch.equal(weights, composite.composite_weights(tau, offsets))
-    with backends.use_backend("torch"):
-        assert torch.equal(backends.composite_weights(tau, offsets), plain.composite_weights(tau, offsets))
+    with ops.use_backend("torch"):
+        plain = ops.composite_weights.reference(tau, offsets)
+        assert torch.equal(ops.composite_weights(tau, offsets), plain)
     assert torch.equal(
-        backends.accumulate(weights, values, offsets), composite.accumulate(weights, values, offsets)
+        ops.accumulate(weights, values, offsets), composite.accumulate(weights, values, offsets)
     )
-    assert torch.equal(backends.terminate(tau, offsets, 0.4), composite.terminate(tau, offsets, 0.4))
+    assert torch.equal(ops.terminate(tau, offsets, 0.4), composite.terminate(tau, offsets, 0.4))

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from gridreg.encodings import positional_encoding
 from gridreg.errors import InputError
+from gridreg.ops import use_backend
 from gridreg.ops.encode import encode, encode_together
-from gridreg.ops.rays import use_backend
 
 
 def draw(rows: int, dims: int, seed: int, spread: float = 2.0) -> torch.Tensor:

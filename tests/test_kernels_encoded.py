@@ -12,14 +12,13 @@ from hypothesis import strategies as st
 
 from gridreg.encodings import positional_encoding
 from gridreg.errors import InputError
-from gridreg.ops import Block, encoded_mlp
+from gridreg.ops import Block, encoded_mlp, use_backend
 from gridreg.ops.cpu.jit.bfloat16 import load_low, store_low
 from gridreg.ops.cpu.jit.compiler import float32, kernel, next_task, uint16, vector
 from gridreg.ops.cpu.jit.launch import launch
 from gridreg.ops.cpu.jit.simd import LANES, load, one, store, wide
 from gridreg.ops.cpu.mlp.chain import CHUNK, CHUNK_TAIL, padded_rows
 from gridreg.ops.linear import Layer
-from gridreg.ops.rays import use_backend
 
 
 def draw(*shape, seed=0, scale=1.0):

@@ -11,10 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gridreg.errors import InputError
-from gridreg.ops import linear
+from gridreg.ops import linear, use_backend
 from gridreg.ops.cpu.mlp import chain
 from gridreg.ops.linear import Layer, bfloat16_is_fast, mlp
-from gridreg.ops.rays import use_backend
 
 
 def draw(*shape: int, seed: int = 0) -> torch.Tensor:

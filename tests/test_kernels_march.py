@@ -9,9 +9,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gridreg import ops
 from gridreg.errors import InputError
-from gridreg.ops import ray_reference as plain
-from gridreg.ops.cpu.march import march
 
 BOUNDS = torch.tensor([[-1.0, -0.5, 0.0], [1.0, 1.5, 1.0]])
 
@@ -31,6 +30,14 @@ def random_scene(seed: int, rays: int, shape: tuple[int, int, int], fill: float)
     cells = (torch.rand(shape, generator=g) < fill).to(torch.uint8)
     jitter = torch.rand(rays, generator=g)
     return middle - 2 * directions, directions, t_min, t_max, cells, jitter
+
+
+def march(*arguments):
+    return ops.march.compiled(ops.MarchArguments(*arguments))
+
+
+def plain_march(*arguments):
+    return ops.march.reference(ops.MarchArguments(*arguments))
 
 
 def run(implementation, scene, step, jitter=None):
@@ -54,7 +61,7 @@ def assert_same(found, expected):
 )
 def test_same_samples(seed, rays, shape, fill, step):
     scene = random_scene(seed, rays, shape, fill)
-    assert_same(run(march, scene, step), run(plain.march, scene, step))
+    assert_same(run(march, scene, step), run(plain_march, scene, step))
 
 
 @pytest.mark.parametrize("offset", [0.0, 1e-7, -1e-7, 5e-4])
@@ -66,7 +73,7 @@ def test_rays_along_cell_faces(offset):
     d = torch.tensor([[1.0, 0.0, 0.0]]).expand(17, 3)
     arguments = (o, d, torch.full((17,), 0.5), torch.full((17,), 3.5), 0.0625, cells, BOUNDS)
     for jitter in (0.0, 0.5):
-        assert_same(march(*arguments, jitter), plain.march(*arguments, jitter))
+        assert_same(march(*arguments, jitter), plain_march(*arguments, jitter))
 
 
 def test_number_or_tensor_as_jitter():
@@ -96,7 +103,7 @@ def test_long_rays():
     cells[60] = 1
     arguments = (o, d, torch.zeros(1), torch.full((1,), 2000.0), 0.25, cells, BOUNDS * 100, 0.25)
     found = march(*arguments)
-    assert_same(found, plain.march(*arguments))
+    assert_same(found, plain_march(*arguments))
     assert found[1].numel() > 0
 
 
@@ -104,7 +111,7 @@ def test_nan_and_infinite_ranges():
     scene = random_scene(4, 8, (7, 6, 5), 0.5)
     scene[3][1] = math.nan
     scene[0][2] = math.nan
-    assert_same(run(march, scene, 0.05), run(plain.march, scene, 0.05))
+    assert_same(run(march, scene, 0.05), run(plain_march, scene, 0.05))
     scene[3][1] = math.inf
     with pytest.raises(InputError, match="steps"):
         run(march, scene, 0.05)

@@ -240,7 +240,6 @@ def test_forked_process():
     child = os.fork()
     if child == 0:
         torch.set_num_threads(1)
-        from gridreg.ops.cpu import autograd
         import gridreg.ops.cpu.jit.launch as team
         assert team._state["forked"]
         torch.set_num_threads(2)

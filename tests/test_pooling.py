@@ -7,9 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
-import gridreg.ops  # noqa: F401  (registers the compiled pools)
-from gridreg.ops import rays as backends
-from gridreg.ops.pooling import pool_faint
+from gridreg import ops
+from gridreg.ops.merging import merge_neighbours
 from gridreg.rendering import MarchSettings, OccupancyGrid, Rays, render, render_rays
 
 
@@ -31,7 +30,7 @@ def packed(draw: st.DrawFn) -> tuple[Tensor, Tensor]:
 @given(samples=packed(), bound=st.sampled_from([1e-3, 1e-2, 0.3]), seed=st.none() | st.integers(0, 99))
 def test_pools_are_runs_of_faint_neighbours_on_one_ray(samples, bound, seed):
     weights, rays = samples
-    speakers, pools = pool_faint(weights, rays, bound, None if seed is None else seeded(seed))
+    speakers, pools = merge_neighbours(weights, rays, bound, None if seed is None else seeded(seed))
     assert pools.shape == weights.shape
     # Every pool has its speaker among its members, and pools follow one another.
     assert torch.equal(pools[speakers], torch.arange(len(speakers)))
@@ -57,8 +56,8 @@ def test_compiled_pools_are_the_plain_ones(samples, bounds, seed):
     offsets[1:] = torch.bincount(rays, minlength=9).cumsum(0)
     found = []
     for name in ("compiled", "torch"):
-        with backends.use_backend(name):
-            found.append(backends.pool(weights, offsets, *bounds, None if seed is None else seeded(seed)))
+        with ops.use_backend(name):
+            found.append(ops.merge_samples(weights, offsets, *bounds, None if seed is None else seeded(seed)))
     for compiled, plain in zip(*found, strict=True):
         assert torch.equal(compiled, plain)
     speakers, of_rays, pools = found[0]
@@ -71,20 +70,20 @@ def test_colours_of_pools_and_their_gradients(samples, floor, channels):
     weights, rays = samples
     offsets = torch.zeros(9, dtype=torch.int64)
     offsets[1:] = torch.bincount(rays, minlength=8).cumsum(0)
-    speakers, _, pools = backends.pool(weights, offsets, floor, 0.1)
+    speakers, _, pools = ops.merge_samples(weights, offsets, floor, 0.1)
     colours = torch.rand(len(speakers), channels, generator=seeded()).requires_grad_()
     upstream = torch.rand(len(weights), channels, generator=seeded(1))
     found = []
     for name in ("compiled", "torch"):
-        with backends.use_backend(name):
-            out = backends.spread(colours, pools, speakers)
+        with ops.use_backend(name):
+            out = ops.spread_to_samples(colours, pools, speakers)
             found.append((out.detach(), *torch.autograd.grad(out, colours, upstream)))
     torch.testing.assert_close(found[0][0], found[1][0], rtol=0, atol=0)
     torch.testing.assert_close(found[0][1], found[1][1])
 
 
 def test_no_samples():
-    speakers, pools = pool_faint(torch.empty(0), torch.empty(0, dtype=torch.int64), 0.1, seeded())
+    speakers, pools = merge_neighbours(torch.empty(0), torch.empty(0, dtype=torch.int64), 0.1, seeded())
     assert speakers.shape == pools.shape == (0,)
 
 
@@ -92,7 +91,7 @@ def test_speakers_are_drawn_in_proportion_to_weight():
     weights, rays = torch.tensor([1e-4, 3e-4, 6e-4]), torch.zeros(3, dtype=torch.int64)
     generator, count = seeded(), torch.zeros(3)
     for _ in range(4000):
-        speakers, _ = pool_faint(weights, rays, 1e-2, generator)
+        speakers, _ = merge_neighbours(weights, rays, 1e-2, generator)
         count[speakers] += 1
     # Standard error of a share: below 0.008.
     torch.testing.assert_close(count / 4000, torch.tensor([0.1, 0.3, 0.6]), atol=0.035, rtol=0)

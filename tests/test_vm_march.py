@@ -8,7 +8,7 @@ from torch.nn import functional as F
 
 import gridreg
 from backbones.vm import VMField
-from gridreg.ops.rays import use_backend
+from gridreg.ops import use_backend
 from gridreg.rendering import MarchSettings, OccupancyGrid, Rays, render_rays
 
 BOX = torch.tensor([[-1.0, -2.0, 0.0], [1.0, 1.0, 3.0]])

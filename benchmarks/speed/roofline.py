@@ -12,7 +12,7 @@ from torch import Tensor
 from backbones.vm import LINE_AXES, PLANE_AXES
 from gridreg.attach._hooks import open_channels
 from gridreg.errors import InputError
-from gridreg.ops.cpu import autograd
+from gridreg.ops.cpu import lookups
 from gridreg.ops.cpu.reductions import thin
 from gridreg.ops.linear import product_dtype
 
@@ -86,7 +86,7 @@ def felt_by(situation: Situation, turn: int) -> Tensor:
         found.append(rounded != 0)
         return rounded
 
-    with replaced(autograd, "thin", watched):
+    with replaced(lookups, "thin", watched):
         situation.run(turn)
     return found[0]
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from gridreg.errors import InputError
-from gridreg.ops.rays import use_backend
+from gridreg.ops import use_backend
 from gridreg.rendering import OccupancyGrid, Rays
 from gridreg.scenes import Scene
 from gridreg.training import RunConfig, Trainer, build_trainer, events, load_preset, load_run, regularizers_of

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from gridreg.ops.rays import use_backend
+from gridreg.ops import use_backend
 from gridreg.scenes import Scene
 from gridreg.training import RunConfig
 

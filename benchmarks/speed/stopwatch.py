@@ -15,9 +15,7 @@ import torch
 import gridreg.training.trainer as trainer_module
 from gridreg import ops
 from gridreg.ops import linear
-from gridreg.ops import ray_reference as plain
-from gridreg.ops import rays as backends
-from gridreg.ops.cpu import autograd, cp, vm_gradient
+from gridreg.ops.cpu import cp, lookups, vm_gradient
 from gridreg.ops.cpu.mlp import fused as perceptron
 from gridreg.rendering import render
 from gridreg.training import Trainer
@@ -114,9 +112,9 @@ def places_of(trainer: Trainer) -> list[Place]:
     found = [
         Place(trainer.bank, "draw", "rays"),
         Place(render, "box_intersection", "rays"),
-        Place(backends, "march", "march"),
-        Place(plain, "march", "march"),
-        Place(autograd, "mark", "march"),
+        Place(ops.march, "compiled", "march"),
+        Place(ops.march, "reference", "march"),
+        Place(lookups, "mark", "march"),
         Place(field, _first(field, "march_density", "density"), "density"),
         Place(field, _first(field, "colour_of_rays", "colour"), "colour/network"),
         Place(ops, "vm_features", "colour/lookup"),

@@ -16,8 +16,8 @@ from typing import Any
 import torch
 
 from gridreg.errors import InputError
+from gridreg.ops import use_backend
 from gridreg.ops.cpu.jit.compiler import Kernel
-from gridreg.ops.rays import use_backend
 from gridreg.training import Execution, StepReport, TrainSettings, execute
 from gridreg.training.files import write_json
 

@@ -1,40 +1,53 @@
-"""The inner loops of our fields: plain PyTorch versions, compiled ones for the CPU, and the choice between them."""
+"""The inner loops of our fields and renderer, each a function that a compiled version may stand in for.
+
+Importing this package registers the compiled versions, if numba is there; see `gridreg.ops.dispatch`.
+"""
 
 from __future__ import annotations
 
-from gridreg.ops.cpu import composite
-from gridreg.ops.cpu.autograd import accumulate_into_grad
+import importlib
+import importlib.util
+
+from gridreg.ops.composite import accumulate, composite_weights, pixels, terminate
+from gridreg.ops.cp import cp_density, cp_features, cp_march_density
+from gridreg.ops.dispatch import chosen_backend, use_backend
 from gridreg.ops.encode import encode, encode_together
 from gridreg.ops.encoded_mlp import Block, encoded_mlp
-from gridreg.ops.grid_lookup import (
-    Activation,
-    MarchArguments,
-    cp_density,
-    cp_features,
-    cp_march_density,
-    vm_density,
-    vm_features,
-    vm_march_density,
-)
+from gridreg.ops.gradient_buffers import accumulate_into_grad
 from gridreg.ops.linear import Layer, mlp, product_dtype
+from gridreg.ops.merging import merge_samples, spread_to_samples
+from gridreg.ops.ray_marching import Activation, MarchArguments, RayMarchResult, march, march_density
+from gridreg.ops.vm import vm_density, vm_features, vm_march_density
 
 __all__ = [
     "Activation",
     "Block",
     "Layer",
     "MarchArguments",
+    "RayMarchResult",
+    "accumulate",
     "accumulate_into_grad",
+    "chosen_backend",
+    "composite_weights",
     "cp_density",
     "cp_features",
     "cp_march_density",
     "encode",
     "encode_together",
     "encoded_mlp",
+    "march",
+    "march_density",
+    "merge_samples",
     "mlp",
+    "pixels",
     "product_dtype",
+    "spread_to_samples",
+    "terminate",
+    "use_backend",
     "vm_density",
     "vm_features",
     "vm_march_density",
 ]
 
-composite.register()
+if importlib.util.find_spec("numba") is not None:
+    importlib.import_module("gridreg.ops.cpu.registered")

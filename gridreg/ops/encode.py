@@ -15,7 +15,7 @@ from gridreg.errors import InputError
 from gridreg.ops.cpu.jit.compiler import float32, inline, integer, kernel, matrix, next_task, real
 from gridreg.ops.cpu.jit.launch import launch
 from gridreg.ops.cpu.jit.simd import LANES, load, one, store, wide
-from gridreg.ops.rays import takes_compiled
+from gridreg.ops.dispatch import takes_compiled
 
 __all__ = ["MOST_OCTAVES", "encode", "encode_together"]
 

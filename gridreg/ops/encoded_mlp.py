@@ -32,9 +32,9 @@ from gridreg.ops.cpu.jit.simd import LANES, load, one, wide
 from gridreg.ops.cpu.mlp.chain import chain_backward, chain_forward
 from gridreg.ops.cpu.mlp.fused import Block, fits, perceptron
 from gridreg.ops.cpu.mlp.octaves import read_octaves, write_octaves
+from gridreg.ops.dispatch import takes_compiled
 from gridreg.ops.encode import MOST_OCTAVES, encode, encode_together
 from gridreg.ops.linear import Layer, Precision, check_layers, check_precision, mlp, product_dtype
-from gridreg.ops.rays import takes_compiled
 
 __all__ = ["Block", "encoded_mlp"]
 

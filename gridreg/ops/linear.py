@@ -20,7 +20,7 @@ from torch.nn import functional as F
 
 from gridreg.errors import InputError
 from gridreg.ops.cpu.mlp.chain import chain_backward, chain_forward
-from gridreg.ops.rays import takes_compiled
+from gridreg.ops.dispatch import takes_compiled
 
 __all__ = [
     "Layer",

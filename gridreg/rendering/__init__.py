@@ -1,12 +1,12 @@
 """Rays in, pixels out: box intersection, occupancy, march and compositing."""
 
+from gridreg.ops import RayMarchResult, chosen_backend, use_backend
 from gridreg.rendering.ensemble import Ensemble
 from gridreg.rendering.occupancy import OccupancyGrid, visual_hull
 from gridreg.rendering.rays import Rays, box_intersection, camera_rays, pixel_rays
 from gridreg.rendering.render import (
     Field,
     MarchSettings,
-    RayMarchResult,
     Rendered,
     SampleHook,
     composite,
@@ -25,9 +25,11 @@ __all__ = [
     "SampleHook",
     "box_intersection",
     "camera_rays",
+    "chosen_backend",
     "composite",
     "pixel_rays",
     "render_image",
     "render_rays",
+    "use_backend",
     "visual_hull",
 ]

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from gridreg.ops import rays as backends
+from gridreg import ops
 from gridreg.rendering.occupancy import OccupancyGrid
 from gridreg.rendering.rays import Rays, box_intersection, camera_rays
 from gridreg.samples import RaySamples
@@ -17,7 +17,6 @@ from gridreg.samples import RaySamples
 __all__ = [
     "Field",
     "MarchSettings",
-    "RayMarchResult",
     "Rendered",
     "SampleHook",
     "render_image",
@@ -32,8 +31,9 @@ class Field(Protocol):
     """What the renderer asks of a field.
 
     It may also offer ``march_density(rays, t_min, t_max, step, occupancy, jitter, transmittance_bound)``, which returns
-    `RayMarchResult`; ``colour_of_rays(x, directions, ray_indices)``, which takes directions ``(R, 3)`` by ray; and
-    ``colour_of_features(features, directions, ray_indices)`` for the features that its march returned.
+    a `gridreg.ops.RayMarchResult` (or a plain tuple of its first five or more); ``colour_of_rays(x, directions,
+    ray_indices)``, which takes directions ``(R, 3)`` by ray; and ``colour_of_features(features, directions,
+    ray_indices)`` for the features that its march returned.
     """
 
     bounds: Tensor
@@ -65,8 +65,8 @@ class MarchSettings:
         transmittance_bound: samples behind this transmittance are dropped, unitless; the colour of a pixel
             changes by at most this much. 0 keeps them all.
         weight_bound: colour is evaluated only where the weight exceeds this (TensoRF uses 1e-4).
-        merge_weight: neighbours on a ray that weigh less than this share the colour of one of them, see
-            `gridreg.ops.pooling`. 0: every sample has its own.
+        merge_weight: low-weight samples, lighter than this, are merged with their neighbours on the ray and have the
+            colour of one of them, see `gridreg.ops.merging`. 0: every sample has its own.
     """
 
     step: float
@@ -96,34 +96,6 @@ class Rendered:
     coloured: Tensor | None = None
 
 
-@dataclass(frozen=True)
-class RayMarchResult:
-    """The samples that a march kept, packed by ray, and their density.
-
-    A field's own `march_density` may return a plain tuple of the first five or more.
-
-    Args:
-        offsets: ``(R + 1,)`` int64.
-        index: ``(N,)`` int64, number of the sample on its ray, skipped ones included.
-        t: ``(N,)`` distance along the ray, world units.
-        positions: ``(N, 3)``, world units.
-        density: ``(N,)`` per world unit.
-        delta: ``(N,)`` length of the sample's interval, world units; None: one step.
-        ray_steps: ``(R,)`` int64, samples of each ray, skipped ones included; None: as the step says, or with
-            ``delta`` up to the last one kept.
-        features: ``(N, F)`` for the field's `colour_of_features`, or None.
-    """
-
-    offsets: Tensor
-    index: Tensor
-    t: Tensor
-    positions: Tensor
-    density: Tensor
-    delta: Tensor | None = None
-    ray_steps: Tensor | None = None
-    features: Tensor | None = None
-
-
 def _march(
     field: Any,
     rays: Rays,
@@ -131,31 +103,22 @@ def _march(
     occupancy: OccupancyGrid,
     march: MarchSettings,
     jitter: Tensor,
-) -> RayMarchResult:
+) -> ops.RayMarchResult:
     """The samples that are not hidden."""
     t_min, t_max = t_range
-    fused = getattr(field, "march_density", None)
-    if fused is not None:
-        found = fused(rays, t_min, t_max, march.step, occupancy, jitter, march.transmittance_bound)
-        return found if isinstance(found, RayMarchResult) else RayMarchResult(*found)
-    offsets, index, t, positions = backends.march(
+    if getattr(field, "march_density", None) is not None:
+        return ops.RayMarchResult(
+            *field.march_density(rays, t_min, t_max, march.step, occupancy, jitter, march.transmittance_bound)
+        )
+    arguments = ops.MarchArguments(
         rays.origins, rays.directions, t_min, t_max, march.step, occupancy.cells, occupancy.bounds, jitter
     )
-    density = field.density(positions)
-    if march.transmittance_bound > 0:
-        kept = backends.terminate(density.detach() * march.step, offsets, march.transmittance_bound)
-        offsets = _offsets_of(kept, offsets)
-        index, t, positions, density = index[kept], t[kept], positions[kept], density[kept]
-    return RayMarchResult(offsets, index, t, positions, density)
+    return ops.march_density(arguments, field.density, march.transmittance_bound)
 
 
-def _offsets_of(kept: Tensor, offsets: Tensor) -> Tensor:
-    running = torch.zeros(kept.shape[0] + 1, dtype=torch.int64, device=kept.device)
-    torch.cumsum(kept, 0, out=running[1:])
-    return running[offsets]
-
-
-def _colours(field: Any, marched: RayMarchResult, chosen: Tensor, rays: Rays, ray_indices: Tensor) -> Tensor:
+def _colours(
+    field: Any, marched: ops.RayMarchResult, chosen: Tensor, rays: Rays, ray_indices: Tensor
+) -> Tensor:
     """Colours of some of the samples; without gradients in blocks, which bounds the memory of a picture's fog."""
     if not torch.is_grad_enabled() and len(chosen) > _BLOCK:
         parts = zip(torch.split(chosen, _BLOCK), torch.split(ray_indices, _BLOCK), strict=True)
@@ -196,8 +159,8 @@ def render_rays(
         jitter: ``(R,)`` in [0, 1), the share of a step by which each ray's samples are shifted; None: 0.5.
         near_far: ``(R,)`` each, instead of the march's near and far.
         hook: gets the samples before they are composited.
-        generator: for training: draws whose colour a pool has (the march's ``merge_weight``); None: that of the sample
-            at half of the pool's weight.
+        generator: for training: draws the representatives of merged samples (the march's ``merge_weight``); None: the
+            samples at half of their weight.
     """
     if jitter is None:
         jitter = torch.full((len(rays),), 0.5, dtype=rays.origins.dtype, device=rays.origins.device)
@@ -214,17 +177,17 @@ def render_rays(
         delta=delta,
         index=marched.index,
         density=marched.density,
-        weights=backends.composite_weights(marched.density * delta, marched.offsets),
+        weights=ops.composite_weights(marched.density * delta, marched.offsets),
         positions=marched.positions,
         directions=rays.directions,
         ray_start=t_min,
         ray_steps=ray_steps,
     )
-    coloured, of_rays, pools = backends.pool(
+    coloured, of_rays, groups = ops.merge_samples(
         samples.weights.detach(), samples.offsets, march.weight_bound, march.merge_weight, generator
     )
-    spoken = _colours(field, marched, coloured, rays, of_rays)
-    colours = backends.spread(spoken, pools, coloured)
+    found = _colours(field, marched, coloured, rays, of_rays)
+    colours = ops.spread_to_samples(found, groups, coloured)
     samples = samples.replace(colours=colours, background=background.expand(len(rays), 3))
     if hook is not None:
         samples = hook.on_samples(samples)
@@ -235,7 +198,7 @@ def composite(samples: RaySamples) -> Rendered:
     """Pixels from samples with colours and background: ``sum w c + (1 - sum w) background``."""
     if samples.colours is None or samples.background is None:
         raise ValueError("samples: found no colours or no background, expected both for compositing")
-    colour, opacity, depth = backends.pixels(
+    colour, opacity, depth = ops.pixels(
         samples.weights, samples.colours, samples.t, samples.background, samples.offsets
     )
     return Rendered(colour, opacity, depth, samples)

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from gridreg import ops
 from gridreg.errors import InputError
-from gridreg.ops import rays as backends
 from gridreg.rendering import OccupancyGrid, Rays, box_intersection, pixel_rays
 from gridreg.scenes import Scene, Views, ndc_rays
 
@@ -119,7 +119,8 @@ def meets(rays: Rays, occupancy: OccupancyGrid, near: float, far: float) -> Tens
     step = float(((occupancy.bounds[1] - occupancy.bounds[0]) / nodes).min()) / 2
     t_min, t_max = box_intersection(rays, occupancy.bounds, near, far)
     jitter = torch.full_like(t_min, 0.5)
-    offsets = backends.march(
+    arguments = ops.MarchArguments(
         rays.origins, rays.directions, t_min, t_max, step, occupancy.cells, occupancy.bounds, jitter
-    )[0]
+    )
+    offsets = ops.march(arguments)[0]
     return offsets[1:] > offsets[:-1]

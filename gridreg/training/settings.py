@@ -38,7 +38,7 @@ class TrainSettings:
         step_ratio: ray step in cells.
         weight_bound: colour is evaluated where the weight exceeds this.
         pool_weight: neighbours on a ray that weigh less than this share the colour of one of them, in training drawn by
-            weight (see `gridreg.ops.pooling`); 0: every sample has its own.
+            weight (see `gridreg.ops.merging`); 0: every sample has its own.
         faint_gradient: gradients of densities below this share of their mean size are rounded at random, to 0 or to the
             share, so that their expectation stays; a field that does not offer it has all of them. 0: none.
         transmittance_bound: samples behind this transmittance are dropped.

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
-from gridreg.ops import ray_reference as plain
+from gridreg.ops import composite as ops
 from gridreg.ops.cpu.jit.compiler import (
     float32,
     int64,
@@ -22,11 +22,8 @@ from gridreg.ops.cpu.jit.compiler import (
     vector,
 )
 from gridreg.ops.cpu.jit.launch import launch
-from gridreg.ops.cpu.march import march
-from gridreg.ops.cpu.pooling import pool, spread
-from gridreg.ops.rays import Backend, register_backend
 
-__all__ = ["accumulate", "composite_weights", "pixels", "register", "terminate"]
+__all__ = ["accumulate", "composite_weights", "pixels", "terminate"]
 
 # Rays of one task.
 _RAYS = 64
@@ -258,36 +255,31 @@ def _seen(table: Any) -> None:
                 transmittance *= through[n]
 
 
+@ops.composite_weights.register_cpu()
 def composite_weights(optical_depth: Tensor, offsets: Tensor) -> Tensor:
-    """See `gridreg.ops.rays.composite_weights`; CPU float32 tensors."""
+    """See `gridreg.ops.composite_weights`."""
     return _Weights.apply(optical_depth, offsets.contiguous())  # type: ignore[no-any-return, no-untyped-call]
 
 
+@ops.accumulate.register_cpu()
 def accumulate(weights: Tensor, values: Tensor, offsets: Tensor) -> Tensor:
-    """See `gridreg.ops.rays.accumulate`; CPU float32 tensors."""
+    """See `gridreg.ops.accumulate`."""
     return _Sums.apply(weights, values, offsets.contiguous())  # type: ignore[no-any-return, no-untyped-call]
 
 
+@ops.pixels.register_cpu(suits=ops.pixels_suit_cpu)
 def pixels(
     weights: Tensor, colours: Tensor, t: Tensor, background: Tensor, offsets: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """See `gridreg.ops.rays.pixels`; CPU float32 tensors."""
-    if t.requires_grad or background.requires_grad:
-        return plain.pixels(weights, colours, t, background, offsets)
+    """See `gridreg.ops.pixels`."""
     return _Pixels.apply(weights, colours, t, background, offsets)  # type: ignore[no-any-return, no-untyped-call]
 
 
+@ops.terminate.register_cpu()
 @torch.no_grad()
 def terminate(optical_depth: Tensor, offsets: Tensor, bound: float) -> Tensor:
-    """See `gridreg.ops.rays.terminate`; CPU float32 tensors."""
+    """See `gridreg.ops.terminate`."""
     mask = torch.empty(optical_depth.shape, dtype=torch.uint8)
     through = optical_depth.neg().contiguous().exp_()
     launch(_seen, _tasks(offsets), offsets.contiguous(), through, float(bound), mask)
     return mask.view(torch.bool)
-
-
-def register() -> None:
-    """Make the compiled march and compositing available to `gridreg.ops.rays`."""
-    register_backend(
-        "compiled", Backend(march, composite_weights, accumulate, terminate, pool, spread, pixels)
-    )

@@ -1,5 +1,4 @@
-"""Compiled ray march: the samples of `gridreg.ops.ray_reference.march`, bit for bit, without visiting empty
-space."""
+"""Compiled ray march: the samples of the plain `gridreg.ops.march`, bit for bit, without visiting empty space."""
 
 from __future__ import annotations
 
@@ -11,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gridreg.ops import ray_marching as ops
 from gridreg.ops.cpu.jit.compiler import (
     cube,
     exact,
@@ -24,14 +24,13 @@ from gridreg.ops.cpu.jit.compiler import (
     vector,
 )
 from gridreg.ops.cpu.jit.launch import launch
-from gridreg.ops.cpu.march_bits import Marked, distance_of, next_bit, sample_at
-from gridreg.ops.ray_reference import CELL_TOLERANCE, steps_bound
+from gridreg.ops.cpu.march_bits import MarchBits, distance_of, next_bit, sample_at
 
 __all__ = ["mark", "march"]
 
 # Edge, in cells, of the blocks that are skipped whole when nothing in them is occupied.
 _COARSE = np.uint32(4)
-_TOLERANCE = np.float32(CELL_TOLERANCE)
+_TOLERANCE = np.float32(ops.CELL_TOLERANCE)
 # Relative rounding of a position computed in float32 by a handful of operations, with room to spare.
 _ROUNDING = np.float32(2e-6)
 _ONE = np.int64(1)
@@ -196,19 +195,11 @@ def _coarse(cells: Tensor, grid: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def mark(
-    origins: Tensor,
-    directions: Tensor,
-    t_min: Tensor,
-    t_max: Tensor,
-    step: float,
-    cells: Tensor,
-    bounds: Tensor,
-    jitter: Tensor | float,
-) -> Marked:
-    """Find the samples of a march; arguments as of `march`."""
+def mark(arguments: ops.MarchArguments) -> MarchBits:
+    """Find the samples of a march."""
+    origins, directions, t_min, t_max, step, cells, bounds, jitter = arguments
     rays = origins.shape[0]
-    steps = steps_bound(t_min, t_max, step)
+    steps = ops.steps_bound(t_min, t_max, step)
     o, d, near, far = (x.contiguous() for x in (origins, directions, t_min, t_max))
     shift = torch.as_tensor(jitter, dtype=torch.float32).expand(rays).contiguous()
     grid = cells.contiguous().view(torch.uint8)
@@ -221,27 +212,19 @@ def mark(
     launch(_mark, tasks if steps else 0, o, d, near, far, shift, step, grid, coarse, box, bits, counts)
     offsets = torch.zeros(rays + 1, dtype=torch.int64)
     torch.cumsum(counts, 0, out=offsets[1:])
-    return Marked(o, d, near, shift, bits, offsets)
+    return MarchBits(o, d, near, shift, bits, offsets)
 
 
+@ops.march.register_cpu()
 @torch.no_grad()
-def march(
-    origins: Tensor,
-    directions: Tensor,
-    t_min: Tensor,
-    t_max: Tensor,
-    step: float,
-    cells: Tensor,
-    bounds: Tensor,
-    jitter: Tensor | float,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """See `gridreg.ops.rays.march`; CPU float32 tensors.
+def march(arguments: ops.MarchArguments) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """See `gridreg.ops.march`.
 
     Empty cells, and whole empty blocks of cells, are left by the step after the ray's exit from them
     (Amanatides and Woo 1987), so the cost follows the number of cells that a ray meets near surfaces; samples
     stay on the lattice.
     """
-    o, d, near, shift, bits, offsets = mark(origins, directions, t_min, t_max, step, cells, bounds, jitter)
+    o, d, near, shift, bits, offsets = mark(arguments)
     samples = int(offsets[-1])
     index, t, positions = (
         torch.empty(samples, dtype=torch.int64),
@@ -255,7 +238,7 @@ def march(
         d,
         near,
         shift,
-        step,
+        arguments.step,
         bits,
         offsets,
         index,

@@ -9,12 +9,12 @@ from torch import Tensor
 
 from gridreg.ops.cpu.jit.compiler import exact, inline, int64
 
-__all__ = ["Marked", "distance_of", "next_bit", "sample_at"]
+__all__ = ["MarchBits", "distance_of", "next_bit", "sample_at"]
 
 _REST = np.int64(2**63 - 1)
 
 
-class Marked(NamedTuple):
+class MarchBits(NamedTuple):
     """The samples of a march before they are written out.
 
     Args:

@@ -13,7 +13,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gridreg.ops.arguments import Activation
 from gridreg.ops.cpu.cp import product_sum
 from gridreg.ops.cpu.grid_coordinates import BATCH, PLACES, find
 from gridreg.ops.cpu.jit.compiler import (
@@ -34,8 +33,9 @@ from gridreg.ops.cpu.jit.compiler import (
 from gridreg.ops.cpu.jit.launch import launch
 from gridreg.ops.cpu.jit.simd import LANES, load, store, wide
 from gridreg.ops.cpu.jit.softplus import softplus
-from gridreg.ops.cpu.march_bits import Marked, distance_of, next_bit, sample_at
+from gridreg.ops.cpu.march_bits import MarchBits, distance_of, next_bit, sample_at
 from gridreg.ops.cpu.vm import find_cells, look_up
+from gridreg.ops.ray_marching import Activation
 
 __all__ = ["Walked", "walk"]
 
@@ -214,7 +214,7 @@ def _write(table: Any) -> None:
 
 
 def walk(
-    marked: Marked,
+    marked: MarchBits,
     *grids: Sequence[Tensor],
     read: int,
     activation: Activation,

@@ -15,7 +15,7 @@ from gridreg.base import LocalTerm
 from gridreg.errors import InputError
 from gridreg.ops.cpu.adam.layout import Layout, Moments, Terms, layout
 from gridreg.ops.cpu.adam.update import Job, update, update_flat
-from gridreg.ops.rays import takes_compiled
+from gridreg.ops.dispatch import takes_compiled
 
 __all__ = ["FusedAdam"]
 

@@ -1,4 +1,4 @@
-"""Compiled pools of faint samples, and the colours that they share: see `gridreg.ops.pooling`."""
+"""Compiled merging of low-weight samples, and the colours that they share."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
+from gridreg.ops import merging as ops
 from gridreg.ops.cpu.jit.compiler import (
     float32,
     inline,
@@ -22,9 +23,8 @@ from gridreg.ops.cpu.jit.compiler import (
     vector,
 )
 from gridreg.ops.cpu.jit.launch import launch
-from gridreg.ops.pooling import UNIT
 
-__all__ = ["pool", "spread"]
+__all__ = ["merge_samples", "spread_to_samples"]
 
 # Rays of one task; samples or pools of one.
 _RAYS = 64
@@ -34,7 +34,7 @@ _SAMPLES = 4096
 @inline
 def _amount(weight: Any) -> Any:
     """A weight as an integer, at least 1."""
-    return max(int64(np.float64(weight) * UNIT), int64(1))
+    return max(int64(np.float64(weight) * ops.UNIT), int64(1))
 
 
 @inline
@@ -115,15 +115,16 @@ def _fill(table: Any) -> None:
                 pool += 1
 
 
-def pool(
-    weights: Tensor, offsets: Tensor, floor: float, bound: float, generator: torch.Generator | None
+@ops.merge_samples.register_cpu()
+def merge_samples(
+    weights: Tensor, offsets: Tensor, floor: float, bound: float, generator: torch.Generator | None = None
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """See `gridreg.ops.rays.pool`; CPU float32 weights."""
+    """See `gridreg.ops.merge_samples`."""
     weights, offsets = weights.detach().contiguous(), offsets.contiguous()
     rays = offsets.shape[0] - 1
     starts = torch.zeros(rays + 1, dtype=torch.int64)
     tasks = -(-rays // _RAYS)
-    numbers = (float(floor), float(bound), max(1, int(bound * UNIT)))
+    numbers = (float(floor), float(bound), max(1, int(bound * ops.UNIT)))
     launch(_count, tasks, offsets, weights, starts[1:], *numbers)
     torch.cumsum(starts[1:], 0, out=starts[1:])
     count = int(starts[-1])
@@ -195,6 +196,7 @@ class _Spread(Function):
         return out, None, None
 
 
-def spread(colours: Tensor, pools: Tensor, speakers: Tensor) -> Tensor:
-    """See `gridreg.ops.rays.spread`; CPU float32 colours."""
-    return _Spread.apply(colours, pools, speakers)  # type: ignore[no-any-return, no-untyped-call]
+@ops.spread_to_samples.register_cpu()
+def spread_to_samples(colours: Tensor, groups: Tensor, representatives: Tensor) -> Tensor:
+    """See `gridreg.ops.spread_to_samples`."""
+    return _Spread.apply(colours, groups, representatives)  # type: ignore[no-any-return, no-untyped-call]

@@ -1,70 +1,25 @@
-"""Compiled lookups as differentiable functions."""
+"""Compiled lookups in VM and CP grids as differentiable functions."""
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from gridreg.ops.arguments import Activation, MarchArguments
+from gridreg.ops import cp as cp_ops
+from gridreg.ops import vm as vm_ops
 from gridreg.ops.cpu import cp, vm, vm_gradient
 from gridreg.ops.cpu.jit.simd import LANES
 from gridreg.ops.cpu.march import mark
 from gridreg.ops.cpu.march_density import walk
 from gridreg.ops.cpu.reductions import thin
+from gridreg.ops.gradient_buffers import gradient_buffers, rounding_fraction
+from gridreg.ops.interpolation import suits_cpu
+from gridreg.ops.ray_marching import Activation, MarchArguments, RayMarchResult
 
-__all__ = ["accumulate_into_grad", "cp_density", "cp_features", "march_density", "vm_density", "vm_features"]
-
-_local = threading.local()
-
-
-@contextmanager
-def accumulate_into_grad(faint: float = 0.0) -> Iterator[None]:
-    """Let compiled backward passes add to the ``.grad`` of planes in place, instead of handing out a new tensor.
-
-    For training loops that keep their gradient buffers: a 300^3 grid has 70 MB of them, and to allocate, fill and
-    add as much again in every iteration costs more than the gradient itself. It holds for backward passes that this
-    thread starts, and for planes that are leaves; hooks of such planes are not called.
-
-    Args:
-        faint: gradients of marched densities below this share of their mean size are rounded at random, to 0 or to the
-            share, so that their expectation stays: see `gridreg.ops.cpu.reductions.thin`. What is 0 is not added to the
-            grids, and most samples lie where hardly anything is. 0: all of them count.
-
-    Example:
-        >>> grids = [torch.ones(2, 2, 4, requires_grad=True) for _ in range(3)], [torch.ones(2, 4)] * 3
-        >>> with accumulate_into_grad():
-        ...     vm_density(torch.zeros(1, 3), *grids, 4).sum().backward()
-        >>> float(grids[0][0].grad.sum())
-        4.0
-    """
-    previous = getattr(_local, "in_place", False), getattr(_local, "faint", 0.0)
-    _local.in_place, _local.faint = True, faint
-    try:
-        yield
-    finally:
-        _local.in_place, _local.faint = previous
-
-
-def _gradient_buffers(planes: Sequence[Tensor], in_place: bool) -> tuple[list[Tensor], list[Tensor | None]]:
-    """Where a backward pass adds to, and what it returns to autograd."""
-    buffers: list[Tensor] = []
-    returned: list[Tensor | None] = []
-    for plane in planes:
-        if in_place and plane.is_leaf and plane.requires_grad:
-            if plane.grad is None:
-                plane.grad = torch.zeros_like(plane, memory_format=torch.contiguous_format)
-            if plane.grad.is_contiguous():
-                buffers.append(plane.grad)
-                returned.append(None)
-                continue
-        buffers.append(torch.zeros_like(plane, memory_format=torch.contiguous_format))
-        returned.append(buffers[-1])
-    return buffers, returned
+__all__: list[str] = []
 
 
 class _Lookup(torch.autograd.Function):
@@ -92,7 +47,7 @@ class _Lookup(torch.autograd.Function):
 
 def _gradients(ctx: Any, u: Tensor, grids: Sequence[Tensor], upstream: Tensor) -> list[Tensor | None]:
     """What a backward pass returns for the grids."""
-    buffers, returned = _gradient_buffers(grids[:-3], getattr(_local, "in_place", False))
+    buffers, returned = gradient_buffers(grids[:-3])
     given = [buffers] if buffers else []
     lines = ctx.backward_pass(
         u.detach().contiguous(), *_parts(grids), ctx.read, upstream.contiguous(), *given
@@ -106,10 +61,10 @@ def _parts(grids: Sequence[Tensor]) -> list[list[Tensor]]:
     return [contiguous[:-3], contiguous[-3:]] if len(grids) > 3 else [contiguous]
 
 
-def _opened(lines: Sequence[Tensor], open_channels: int) -> tuple[Sequence[Tensor], int]:
+def _opened(lines: Sequence[Tensor], open_channels: int | None) -> tuple[Sequence[Tensor], int]:
     """Lines without closed channels, and how many channels to read."""
     channels = lines[0].shape[1]
-    if open_channels >= channels:
+    if open_channels is None or open_channels >= channels:
         return lines, channels
     # Whole vectors are read: closed channels among them must count as 0, and their gradient stops here.
     lines = [torch.cat([x[:, :open_channels], torch.zeros_like(x[:, open_channels:])], 1) for x in lines]
@@ -139,23 +94,23 @@ class _Activated(torch.autograd.Function):
         density, u, *grids = ctx.saved_tensors
         # The derivative of softplus is 1 - exp(-softplus), and 0 where the density is 0: outside the box.
         upstream = torch.expm1(density / -ctx.scale).mul_(upstream).mul_(-ctx.scale)
-        upstream = thin(upstream, getattr(_local, "faint", 0.0))
+        upstream = thin(upstream, rounding_fraction())
         return (None, None, None, None, None, *_gradients(ctx, u, grids, upstream))
 
 
-def march_density(
+def _march_density(
     march: MarchArguments,
     activation: Activation,
     transmittance_bound: float,
     planes: Sequence[Tensor],
     lines: Sequence[Tensor],
-    open_channels: int,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """See `gridreg.ops.vm_march_density`; without planes, a CP grid."""
+    open_channels: int | None,
+) -> RayMarchResult:
+    """March without planes through a CP grid, else through a VM grid."""
     lines, read = _opened(lines, open_channels)
     grids = (*planes, *lines)
     found = walk(
-        mark(*march),
+        mark(march),
         *_parts(grids),
         read=read,
         activation=activation,
@@ -164,7 +119,30 @@ def march_density(
     )
     backward = vm_gradient.density_backward if planes else cp.density_backward
     density: Tensor = _Activated.apply(backward, found.density, found.u, activation.scale, read, *grids)  # type: ignore[no-untyped-call]
-    return found.offsets, found.index, found.t, found.positions, density
+    return RayMarchResult(found.offsets, found.index, found.t, found.positions, density)
+
+
+@vm_ops.vm_march_density.register_cpu()
+def _vm_march_density(
+    march: MarchArguments,
+    activation: Activation,
+    transmittance_bound: float,
+    planes: Sequence[Tensor],
+    lines: Sequence[Tensor],
+    open_channels: int | None = None,
+) -> RayMarchResult:
+    return _march_density(march, activation, transmittance_bound, planes, lines, open_channels)
+
+
+@cp_ops.cp_march_density.register_cpu()
+def _cp_march_density(
+    march: MarchArguments,
+    activation: Activation,
+    transmittance_bound: float,
+    lines: Sequence[Tensor],
+    open_channels: int | None = None,
+) -> RayMarchResult:
+    return _march_density(march, activation, transmittance_bound, (), lines, open_channels)
 
 
 def _lookup(
@@ -173,31 +151,37 @@ def _lookup(
     u: Tensor,
     planes: Sequence[Tensor],
     lines: Sequence[Tensor],
-    open_channels: int,
+    open_channels: int | None,
 ) -> Tensor:
     lines, read = _opened(lines, open_channels)
     out: Tensor = _Lookup.apply(forward, backward, u, read, *planes, *lines)  # type: ignore[no-untyped-call]
     return out
 
 
-def vm_density(u: Tensor, planes: Sequence[Tensor], lines: Sequence[Tensor], open_channels: int) -> Tensor:
-    """See `gridreg.ops.vm_density`."""
+@vm_ops.vm_density.register_cpu(suits=suits_cpu)
+def _vm_density(
+    u: Tensor, planes: Sequence[Tensor], lines: Sequence[Tensor], open_channels: int | None = None
+) -> Tensor:
     return _lookup(vm.density, vm_gradient.density_backward, u, planes, lines, open_channels)
 
 
-def vm_features(
-    u: Tensor, planes: Sequence[Tensor], lines: Sequence[Tensor], open_channels: int, dtype: torch.dtype
+@vm_ops.vm_features.register_cpu(suits=suits_cpu)
+def _vm_features(
+    u: Tensor,
+    planes: Sequence[Tensor],
+    lines: Sequence[Tensor],
+    open_channels: int | None = None,
+    dtype: torch.dtype = torch.float32,
 ) -> Tensor:
-    """See `gridreg.ops.vm_features`."""
     forward = vm.low_features if dtype == torch.bfloat16 else vm.features
     return _lookup(forward, vm_gradient.features_backward, u, planes, lines, open_channels)
 
 
-def cp_density(u: Tensor, lines: Sequence[Tensor], open_channels: int) -> Tensor:
-    """See `gridreg.ops.cp_density`."""
+@cp_ops.cp_density.register_cpu(suits=suits_cpu)
+def _cp_density(u: Tensor, lines: Sequence[Tensor], open_channels: int | None = None) -> Tensor:
     return _lookup(cp.density, cp.density_backward, u, (), lines, open_channels)
 
 
-def cp_features(u: Tensor, lines: Sequence[Tensor], open_channels: int) -> Tensor:
-    """See `gridreg.ops.cp_features`."""
+@cp_ops.cp_features.register_cpu(suits=suits_cpu)
+def _cp_features(u: Tensor, lines: Sequence[Tensor], open_channels: int | None = None) -> Tensor:
     return _lookup(cp.features, cp.features_backward, u, (), lines, open_channels)

@@ -1,0 +1,7 @@
+"""Imports all compiled versions, which register themselves."""
+
+from __future__ import annotations
+
+from gridreg.ops.cpu import composite, lookups, march, merging
+
+__all__ = ["composite", "lookups", "march", "merging"]
