@@ -39,10 +39,10 @@ _ORDER = (
     "cpu.reductions._fold",
     "cpu.mlp.fused_bf16.backward",
     "cpu.mlp.fused_f32.backward",
-    "cpu.pooling._gather",
+    "cpu.merging._gather",
     "cpu.composite._pixels_backward",
     "cpu.composite._pixels_forward",
-    "cpu.pooling._spread",
+    "cpu.merging._spread",
     "cpu.mlp.fused_bf16.forward",
     "cpu.mlp.fused_f32.forward",
 )
