@@ -2,7 +2,7 @@
 
     python benchmarks/ablation_kill.py
 
-Runs the built-in scene; the result goes to benchmarks/results/ablation/kill.json. Exit status 1 if a run ended twice or
+Runs the built-in scene; the result goes to benchmarks/results/ablation.jsonl. Exit status 1 if a run ended twice or
 a number differs.
 """
 
@@ -18,12 +18,12 @@ import tempfile
 import time
 from pathlib import Path
 
+import stored
+
 from gridreg.ablation.store import Store
-from gridreg.training.files import write_json
 from gridreg.training.versions import versions
 
 ROOT = Path(__file__).parents[1]
-RESULT = ROOT / "benchmarks" / "results" / "ablation" / "kill.json"
 STUDY = """
 title: Killed and gone on with
 size: 40
@@ -102,8 +102,7 @@ def main() -> int:
             "seconds_left_alone": round(span, 1),
             "versions": versions(),
         }
-    RESULT.parent.mkdir(parents=True, exist_ok=True)
-    write_json(RESULT, record)
+    stored.save("ablation", "kill", record)
     print(json.dumps({key: value for key, value in record.items() if key != "versions"}))
     all_alive = all(kill["alive"] for kill in kills)
     return 0 if record["runs_that_ended_once"] and not different and all_alive else 1

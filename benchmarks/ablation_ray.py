@@ -4,7 +4,7 @@
 
 Both do two runs of one thread at a time. The overhead compares the time from the second to the last end of a run: both
 workers are warm: neither imports nor compiling count. The result goes to
-benchmarks/results/ablation/ray.json. Exit status 1 if any number differs.
+benchmarks/results/ablation.jsonl. Exit status 1 if any number differs.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ import tempfile
 import time
 from pathlib import Path
 
+import stored
+
 from gridreg.ablation import Processes, RayRunner, Store
 from gridreg.ablation.ray_cluster import import_ray
 from gridreg.ablation.records import Study
 from gridreg.ablation.runners import Event, Runner
 from gridreg.ablation.study import study_from_text
-from gridreg.training.files import write_json
 from gridreg.training.versions import versions
 
 ROOT = Path(__file__).parents[1]
-RESULT = ROOT / "benchmarks" / "results" / "ablation" / "ray.json"
 STUDY = "size: 100\nsteps: {steps}\nseeds: {seeds}\ncompositions: [tensorf, quick]\n"
 WARM = 2
 
@@ -96,8 +96,7 @@ def main() -> int:
         "rounds": rounds,
         "versions": versions(),
     }
-    RESULT.parent.mkdir(parents=True, exist_ok=True)
-    write_json(RESULT, record)
+    stored.save("ablation", "ray", record)
     print(json.dumps({key: record[key] for key in ("runs", "steps", "equal_numbers", "overhead_percent")}))
     return 0 if record["equal_numbers"] else 1
 

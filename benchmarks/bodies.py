@@ -2,26 +2,21 @@
 
     python benchmarks/bodies.py --data DIR
 
-DIR holds the subjects' folders, each with transforms and mesh_gt.ply. One JSON file a run in
-benchmarks/results/bodies/, and a picture of the meshes beside the truth. Runs that are stored already are not computed
-again; `python benchmarks/bodies.py --table` prints the table from the stored files.
+DIR holds the subjects' folders, each with transforms and mesh_gt.ply. One record a run in
+benchmarks/results/bodies.jsonl; meshes, and an image of them beside the truth, in outputs/bodies. Runs that are stored
+already are not computed again; `python benchmarks/bodies.py --table` prints the table from the stored figures.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
-import sys
 import tempfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import stored
 import torch
-
-sys.path.insert(0, str(Path(__file__).parent))
-from mesh_pictures import mesh_picture
-from stored_command import stored_command
+from stored import Record
 
 from gridreg.cli import run_cli
 from gridreg.export import (
@@ -35,26 +30,29 @@ from gridreg.export import (
     save_mesh,
     write_mesh,
 )
+from gridreg.export.compare import sample_surface
 from gridreg.export.pictures import picture
 from gridreg.training import TrainOptions, configure, execute, open_scene
-from gridreg.training.files import check_output_folder, write_json
+from gridreg.training.files import check_output_folder
 from gridreg.training.images import labelled, row, save_png
 
-RESULTS = Path(__file__).parent / "results" / "bodies"
+STUDY = "bodies"
+MESHES = Path("outputs/bodies")
 TRUTH = "mesh_gt.ply"
 # From the front (bodies face -y), from the side, and from behind; degrees around z.
 AZIMUTHS = (0.0, 90.0, 180.0)
 
 
-def result_path(folder: Path, subject: str, protocol: str, arguments: argparse.Namespace) -> Path:
+def record_name(subject: str, protocol: str, arguments: argparse.Namespace) -> str:
     length = "" if arguments.steps is None else f"-{arguments.steps}steps"
-    return folder / f"{subject}-{protocol}-{arguments.preset}{length}-seed{arguments.seed}.json"
+    return f"{subject}-{protocol}-{arguments.preset}{length}-seed{arguments.seed}"
 
 
 def reconstruct(subject: Path, protocol: str, arguments: argparse.Namespace) -> None:
     """Train, cut out the mesh, compare it, store figures and mesh."""
-    target = result_path(arguments.results, subject.name, protocol, arguments)
-    if target.exists() and target.with_suffix(".ply").exists():
+    name = record_name(subject.name, protocol, arguments)
+    target = arguments.meshes / f"{name}.ply"
+    if stored.find(STUDY, name, arguments.results) and target.exists():
         return
     truth = read_mesh(subject / TRUTH)
     options = TrainOptions(
@@ -79,7 +77,7 @@ def reconstruct(subject: Path, protocol: str, arguments: argparse.Namespace) -> 
         renders = [picture(model.render(camera), "rgb") for camera in cameras(truth)]  # type: ignore[arg-type]
     comparison = compare_meshes(mesh, truth)
     metrics["config"] = {**metrics["config"], "scene": subject.name}
-    metrics["command"] = stored_command("benchmarks/bodies.py")
+    metrics["command"] = stored.command_line("benchmarks/bodies.py")
     metrics["mesh"] = {
         **comparison.to_dict(),
         "watertight": mesh.watertight,
@@ -88,14 +86,52 @@ def reconstruct(subject: Path, protocol: str, arguments: argparse.Namespace) -> 
         "density_threshold": mesh.threshold,
         "resolution": arguments.resolution,
     }
-    save_mesh(mesh, target.with_suffix(".ply"))
+    save_mesh(mesh, target)
     save_png(target.with_suffix(".png"), row(renders))
-    write_json(target, metrics)
+    stored.save(STUDY, name, metrics, arguments.results)
     print(table_row(metrics), flush=True)
 
 
+def mesh_image(mesh: Mesh, camera: Camera, *, coloured: bool, samples: int = 1_500_000) -> np.ndarray:
+    """Return an image ``(H, W, 3)`` uint8 of a mesh on white, lit from the camera, without a graphics card.
+
+    Points are spread densely over the surface; the nearest is in front.
+
+    Args:
+        mesh: in world coordinates.
+        camera: from where.
+        coloured: with the colours of the vertices; else grey, which shows the shape.
+        samples: points on the surface; several for each pixel, or holes remain.
+    """
+    points, faces = sample_surface(mesh, samples, torch.Generator().manual_seed(0))
+    corners = mesh.vertices[mesh.faces[faces]]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    pose = camera.pose.double().numpy()
+    local = (points - pose[:3, 3]) @ pose[:3, :3]
+    fx, fy, cx, cy = camera.lens.intrinsics
+    depth = -local[:, 2]
+    safe = np.maximum(depth, 1e-9)
+    column = np.floor(cx + fx * local[:, 0] / safe).astype(int)
+    row = np.floor(cy - fy * local[:, 1] / safe).astype(int)
+    away = points - pose[:3, 3]
+    facing = -(normals * away).sum(axis=1) / np.linalg.norm(away, axis=1)
+    height, width = camera.lens.height, camera.lens.width
+    # Faces that look away are hidden by those before them; drawing them would fill holes wrongly.
+    seen = (depth > 0) & (facing > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    light = 0.25 + 0.75 * np.clip(facing, 0, 1)
+    colour = np.full((len(points), 3), 0.72)
+    if coloured and mesh.colours is not None:
+        colour = mesh.colours[mesh.faces[faces]].mean(axis=1) / 255
+    shaded = np.clip(colour * light[:, None], 0, 1)
+    image = np.full((height, width, 3), 255, np.uint8)
+    order = np.argsort(-depth[seen], kind="stable")
+    image[row[seen][order], column[seen][order]] = np.rint(255 * shaded[seen][order])
+    return image
+
+
 def cameras(truth: Mesh, width: int = 220, height: int = 420) -> list[Camera]:
-    """Where the pictures are taken from: around the true mesh, the same for every run."""
+    """Return where the images are taken from: around the true mesh, the same for every run."""
     low, high = truth.vertices.min(axis=0), truth.vertices.max(axis=0)
     orbit = orbit_of_box(torch.tensor(np.stack([low, high]), dtype=torch.float32), elevation=5.0, angle=38.0)
     lens = Lens.from_angle(20.0, height, width)
@@ -103,14 +139,15 @@ def cameras(truth: Mesh, width: int = 220, height: int = 420) -> list[Camera]:
 
 
 def draw(subject: Path, protocols: list[str], arguments: argparse.Namespace) -> Path:
-    """One picture: a row for each number of views and one for the truth; shape, colours, renders."""
+    """Draw one image: a row for each number of views and one for the truth; shape, colours, renders."""
     truth = read_mesh(subject / TRUTH)
     places = cameras(truth)
     rows = []
     for protocol in protocols:
-        stored = result_path(arguments.results, subject.name, protocol, arguments)
-        metrics = json.loads(stored.read_text())
-        mesh = read_mesh(stored.with_suffix(".ply"))
+        name = record_name(subject.name, protocol, arguments)
+        metrics = stored.find(STUDY, name, arguments.results)
+        assert metrics is not None
+        mesh = read_mesh(arguments.meshes / f"{name}.ply")
         figures = metrics["mesh"]
         title = (
             f"{protocol}: PSNR {metrics['mean']['psnr']:.2f} dB, Chamfer {figures['chamfer_relative']:.2%} of the "
@@ -120,20 +157,20 @@ def draw(subject: Path, protocols: list[str], arguments: argparse.Namespace) -> 
     rows.append(labelled(_shown(truth, places), f"{subject.name}: the true mesh"))
     width = max(r.shape[1] for r in rows)
     padded = [np.pad(r, ((0, 6), (0, width - r.shape[1]), (0, 0)), constant_values=255) for r in rows]
-    name = "+".join(p.removeprefix("human") for p in protocols)
-    target = arguments.results / f"{subject.name}-{name}views-{arguments.preset}.png"
+    views = "+".join(p.removeprefix("human") for p in protocols)
+    target: Path = arguments.meshes / f"{subject.name}-{views}views-{arguments.preset}.png"
     save_png(target, np.concatenate(padded))
     return target
 
 
 def _shown(mesh: Mesh, places: list[Camera]) -> np.ndarray:
-    shapes = [mesh_picture(mesh, camera, coloured=False) for camera in places]
+    shapes = [mesh_image(mesh, camera, coloured=False) for camera in places]
     if mesh.colours is None:
         return row(shapes)
-    return row([*shapes, *(mesh_picture(mesh, camera, coloured=True) for camera in places)])
+    return row([*shapes, *(mesh_image(mesh, camera, coloured=True) for camera in places)])
 
 
-def table_row(metrics: dict[str, Any]) -> str:
+def table_row(metrics: Record) -> str:
     mesh, mean = metrics["mesh"], metrics["mean"]
     return (
         f"| {metrics['scene']} | {metrics['protocol']} | {metrics['steps']} | {metrics['seed']} | {mean['psnr']:.2f} "
@@ -143,14 +180,14 @@ def table_row(metrics: dict[str, Any]) -> str:
     )
 
 
-def table(folder: Path) -> None:
+def table(results: Path) -> None:
     print(
         "| body | protocol | steps | seed | PSNR (dB) | SSIM 11x11 | Chamfer | mesh to truth | truth to mesh "
         "| F-score (1 %) | normals | training (s) |"
     )
     print("|---" * 12 + "|")
-    for path in sorted(folder.glob("*.json")):
-        print(table_row(json.loads(path.read_text())))
+    for record in stored.load(STUDY, results):
+        print(table_row(record))
 
 
 def main() -> int:
@@ -166,7 +203,10 @@ def main() -> int:
     parser.add_argument("--threads", type=int)
     parser.add_argument("--resolution", type=int, default=256, help="lattice nodes of the mesh")
     parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="such as train.rays=2048")
-    parser.add_argument("--results", type=Path, default=RESULTS, help="folder of the JSON files")
+    parser.add_argument(
+        "--meshes", type=Path, default=MESHES, help="folder of the meshes; default: %(default)s"
+    )
+    parser.add_argument("--results", type=Path, default=stored.RESULTS, help="folder of the stored figures")
     parser.add_argument("--table", action="store_true", help="print what is stored, and end")
     arguments = parser.parse_args()
     if arguments.table:
@@ -176,7 +216,7 @@ def main() -> int:
         parser.error("--data: expected the folder that holds the subjects")
     if arguments.threads:
         torch.set_num_threads(arguments.threads)
-    check_output_folder(arguments.results)
+    check_output_folder(arguments.meshes)
     for name in arguments.subjects:
         for protocol in arguments.protocols:
             reconstruct(arguments.data / name, protocol, arguments)
@@ -185,4 +225,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(run_cli(main))
+    raise SystemExit(run_cli(main))

@@ -2,7 +2,7 @@
 
     python benchmarks/kill_resume.py --kills 10
 
-Trains the built-in scene; the result goes to benchmarks/results/kill_resume.json. Exit status 1 if any number differs.
+Trains the built-in scene; the result goes to benchmarks/results/kill_resume.jsonl. Exit status 1 if any number differs.
 """
 
 from __future__ import annotations
@@ -18,14 +18,13 @@ import time
 from pathlib import Path
 
 import safetensors.torch
+import stored
 import torch
 
-from gridreg.training.files import write_json
 from gridreg.training.versions import versions
 
 ROOT = Path(__file__).parents[1]
 PIPES = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-RESULT = ROOT / "benchmarks" / "results" / "kill_resume.json"
 
 
 def command(out: Path, steps: int, resume: bool) -> list[str]:
@@ -106,7 +105,7 @@ def main() -> int:
             "metrics_equal": all(equal for _, equal in results),
             "versions": versions(),
         }
-    write_json(RESULT, record)
+    stored.save("kill_resume", "kill_resume", record)
     shown = ("kills", "runs_compared", "tensors_compared", "tensors_that_differ", "metrics_equal")
     print(json.dumps({key: record[key] for key in shown}))
     return 0 if record["metrics_equal"] and not record["tensors_that_differ"] else 1

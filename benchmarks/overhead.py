@@ -6,28 +6,25 @@
 Fields with the same values, a ball that rays end in as they end in a trained surface, do the same step (render 1,024
 rays, backward pass, Adam): one bare; one with masks on all five sites that have opened fully, as they are at the end of
 a run; one with the same masks half-way; and a second bare one, whose ratio shows the noise. Prints and stores the
-medians of the ratios, turn by turn, with the interval that holds the middle half. JSON in benchmarks/results/overhead/.
+medians of the ratios, turn by turn, with the interval that holds the middle half (benchmarks/results/overhead.jsonl).
 """
 
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+import stored
 import torch
-
-sys.path.insert(0, str(Path(__file__).parent))
-from speed.ball import BallStep, as_contestants, ball_field, ball_rays
-from speed.common import at_least, in_turns, medians, ratios
+from timing.ball import BallStep, as_contestants, ball_field, ball_rays
+from timing.common import at_least, in_turns, medians, ratios
 
 import gridreg
 from gridreg.cli import run_cli
-from gridreg.training.files import check_output_folder, write_json
 from gridreg.training.versions import versions
 
-RESULTS = Path(__file__).parent / "results" / "overhead"
+STUDY = "overhead"
 SITES = ("density", "appearance", "encoding.features", "encoding.direction", "encoding.position")
 # By name, the share of the run at which the masks stand; None: no composition.
 SETTINGS: dict[str, float | None] = {
@@ -56,7 +53,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--rays", type=at_least(1), default=1024)
     parser.add_argument("--repeats", type=at_least(2), default=100)
     parser.add_argument("--threads", type=at_least(1), default=torch.get_num_threads())
-    parser.add_argument("--results", type=Path, default=RESULTS, help="folder of the JSON file")
+    parser.add_argument("--results", type=Path, default=stored.RESULTS, help="folder of the stored figures")
     arguments = parser.parse_args(words)
     torch.set_num_threads(arguments.threads)
     steps = {
@@ -84,10 +81,10 @@ def main(words: Sequence[str] | None = None) -> int:
     for name, ratio in found.items():
         median, low, high = (100 * (ratio[key] - 1) for key in ("median", "quarter", "three_quarters"))
         print(f"{name:>15} / bare: {median:+.1f} % (middle half {low:+.1f} to {high:+.1f} %)")
-    folder = check_output_folder(arguments.results)
-    write_json(folder / f"{arguments.backbone}-{arguments.edge}-{arguments.threads}threads.json", result)
+    name = f"{arguments.backbone}-{arguments.edge}-{arguments.threads}threads"
+    stored.save(STUDY, name, result, arguments.results)
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(run_cli(main))
+    raise SystemExit(run_cli(main))

@@ -1,22 +1,17 @@
-"""Time, memory and roofline of training and rendering on a processor; tables on the screen, JSON in results/speed.
+"""Time, memory and roofline of training and rendering on a processor; figures are kept in results/speed.jsonl.
 
     python benchmarks/speed.py COMMAND [OPTIONS]
     python benchmarks/speed.py step --scene DIR
     python benchmarks/speed.py table
 
-The code is in the folder of the same name; docs/speed.md explains the commands.
+The code is in the folder timing; docs/speed.md explains the commands.
 """
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
-# A folder with an __init__.py comes before a file of the same name.
-sys.path.insert(0, str(Path(__file__).parent))
-from speed.main import main
+from timing.main import main
 
 from gridreg.cli import run_cli
 
 if __name__ == "__main__":
-    sys.exit(run_cli(main))
+    raise SystemExit(run_cli(main))

@@ -11,7 +11,9 @@ ROOT = Path(__file__).parents[1]
 
 
 def module_at(path: Path) -> ModuleType:
-    """The module that a file makes, under the name of the file."""
+    """Return the module that a file makes, under the name of the file; it finds what lies beside it."""
+    if str(path.parent) not in sys.path:
+        sys.path.insert(0, str(path.parent))
     spec = importlib.util.spec_from_file_location(path.stem, path)
     assert spec is not None
     assert spec.loader is not None

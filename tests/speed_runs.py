@@ -13,8 +13,9 @@ import pytest
 import torch
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
-from speed import main
-from speed.work import Counts
+import stored
+from timing import main
+from timing.work import Counts
 
 __all__ = ["COUNTS", "SMALL", "TINY", "one_thread", "run"]
 
@@ -54,11 +55,10 @@ def one_thread() -> Iterator[None]:
 
 def run(words: list[str], results: Path, capsys: pytest.CaptureFixture[str]) -> tuple[dict[str, Any], str]:
     """Run a command; what it stored and what it printed."""
-    before = set(results.glob("*.json"))
+    before = {record["name"] for record in stored.load("speed", results)}
     assert main.main([*words, "--threads", "1", "--results", str(results)]) == 0
-    (target,) = set(results.glob("*.json")) - before
-    record = json.loads(target.read_text())
+    (record,) = (record for record in stored.load("speed", results) if record["name"] not in before)
     assert record["threads"] == record["versions"]["threads"] == 1
-    assert target.name.startswith(words[0])
-    assert str(results) not in target.read_text()
+    assert record["name"].startswith(words[0])
+    assert str(results) not in json.dumps(record)
     return record, capsys.readouterr().out

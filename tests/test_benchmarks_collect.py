@@ -32,7 +32,7 @@ class _Store:
         return self.runs
 
 
-def test_finished_runs_become_files(
+def test_finished_runs_become_records(
     collect: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     runs = [
@@ -41,12 +41,14 @@ def test_finished_runs_become_files(
         ablation_results.failed(ablation_results.spec("none"), "died"),
     ]
     monkeypatch.setattr(collect.Store, "open", lambda folder, create: _Store(runs))
-    written = collect.collect(tmp_path, "example", tmp_path / "results")
-    assert [path.name for path in written] == ["lego-grid_to_200_3-seed0.json", "lego-tensorf-seed2.json"]
-    record = json.loads(written[0].read_text())
+    names = collect.collect(tmp_path, "example", tmp_path / "results")
+    assert names == ["lego-grid_to_200_3-seed0", "lego-tensorf-seed2"]
+    text = (tmp_path / "results" / "example.jsonl").read_text()
+    record, other = map(json.loads, text.splitlines())
+    assert [record["name"], other["name"]] == names
     assert (record["label"], record["baseline"], record["mean"]["psnr"]) == ("grid to 200^3", "tensorf", 25.0)
     assert record["config"]["scene"] == "lego"
-    assert str(tmp_path) not in written[0].read_text()
+    assert str(tmp_path) not in text
 
 
 def test_a_store_that_is_not_there(

@@ -63,8 +63,8 @@ def words(kept: tuple[Path, Path], results: Path, *more: str) -> list[str]:
 def test_two_seeds_then_three(program: ModuleType, kept: tuple[Path, Path], tmp_path: Path) -> None:
     assert program.main(words(kept, tmp_path)) == 0
     name = f"{kept[0].name}-builtin8-small-seeds"
-    assert {path.name for path in tmp_path.iterdir()} == {f"{name}0,1.json", f"{name}0,1,2.json"}
-    record = json.loads((tmp_path / f"{name}0,1,2.json").read_text())
+    two, record = map(json.loads, (tmp_path / "ensembles.jsonl").read_text().splitlines())
+    assert [two["name"], record["name"]] == [f"{name}0,1", f"{name}0,1,2"]
     alone = [
         json.loads((kept[1] / f"{kept[0].name}-builtin8-small-seed{seed}" / "metrics.json").read_text())
         for seed in range(3)
@@ -81,10 +81,11 @@ def test_two_seeds_then_three(program: ModuleType, kept: tuple[Path, Path], tmp_
 def test_what_is_stored_is_not_computed_again(
     program: ModuleType, kept: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    stored = tmp_path / f"{kept[0].name}-builtin8-small-seeds0,1.json"
-    stored.write_text("{}")
+    stored = tmp_path / "ensembles.jsonl"
+    text = json.dumps({"name": f"{kept[0].name}-builtin8-small-seeds0,1"})
+    stored.write_text(text)
     assert program.main(words(kept, tmp_path, "--seeds", "0", "1")) == 0
-    assert stored.read_text() == "{}"
+    assert stored.read_text() == text
     assert capsys.readouterr().out == ""
 
 

@@ -1,4 +1,4 @@
-"""The picture of a view, of what runs make of it, and of their errors."""
+"""The image of a view, of what runs make of it, and of their errors."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.programs import ROOT, module_at
 
 @pytest.fixture(scope="module")
 def program():
-    return module_at(ROOT / "benchmarks" / "error_pictures.py")
+    return module_at(ROOT / "benchmarks" / "error_images.py")
 
 
 @pytest.fixture(scope="module")
@@ -52,9 +52,7 @@ def call(program, monkeypatch, path: Path, folder: Path, into: Path, *more: str)
         "--protocol",
         "builtin8",
     ]
-    monkeypatch.setattr(
-        sys, "argv", ["error_pictures.py", *words, "--into", str(into), "--size", "96", *more]
-    )
+    monkeypatch.setattr(sys, "argv", ["error_images.py", *words, "--into", str(into), "--size", "96", *more])
     return run_cli(program.main)
 
 
@@ -65,7 +63,7 @@ def test_the_median_view_with_its_target_renders_and_errors(program, kept, monke
     found = imageio.imread(tmp_path / f"{path.name}-{middle}.png")
     assert str(tmp_path / f"{path.name}-{middle}.png") in capsys.readouterr().out
     half = found.shape[0] // 2
-    # Pixels of 3 by 3, with gaps of 4 between pictures.
+    # Pixels of 3 by 3, with gaps of 4 between images.
     target, good, black = (found[half - 96 : half : 3, x : x + 96 : 3] for x in (0, 100, 200))
     np.testing.assert_array_equal(target, good)
     assert black.max() == 0

@@ -33,18 +33,19 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return builtin_scene(tmp_path_factory.mktemp("data"), size=24)
 
 
-def run(program: ModuleType, place: Path, keep: Path, *, resume: bool) -> None:
-    program.score(place, "quick", 0, 12, "builtin8", "auto", SMALL, keep, resume)
+def run(program: ModuleType, place: Path, keep: Path, results: Path, *more: str) -> list[dict[str, Any]]:
+    """Do a short run, and return what is stored then."""
+    words = ["--data", str(place.parent), "--scenes", place.name, "--steps", "12", "--protocol", "builtin8"]
+    program.main([*words, "--keep", str(keep), "--results", str(results), *more, "--set", *SMALL])
+    return [json.loads(line) for line in (results / "quality.jsonl").read_text().splitlines()]
 
 
 def test_a_stopped_run_goes_on(
     program: ModuleType, place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(program, "RESULTS", tmp_path / "whole")
-    run(program, place, tmp_path / "kept whole", resume=True)  # there is nothing to go on with yet
-    (whole,) = [json.loads(path.read_text()) for path in (tmp_path / "whole").iterdir()]
+    # There is nothing to go on with yet.
+    (whole,) = run(program, place, tmp_path / "kept whole", tmp_path / "whole", "--resume")
 
-    monkeypatch.setattr(program, "RESULTS", tmp_path / "stopped")
     each = program.Trained.step
 
     def interrupted(self: Any, report: Any) -> None:
@@ -55,22 +56,17 @@ def test_a_stopped_run_goes_on(
     with monkeypatch.context() as patch:
         patch.setattr(program.Trained, "step", interrupted)
         with pytest.raises(KeyboardInterrupt):
-            run(program, place, tmp_path / "kept", resume=False)
+            run(program, place, tmp_path / "kept", tmp_path / "stopped")
     assert not (tmp_path / "stopped").exists()
-    run(program, place, tmp_path / "kept", resume=True)
-    (resumed,) = [json.loads(path.read_text()) for path in (tmp_path / "stopped").iterdir()]
+    (resumed,) = run(program, place, tmp_path / "kept", tmp_path / "stopped", "--resume")
     assert resumed["images"] == whole["images"]
     assert resumed["command"] == whole["command"]
     assert resumed["spans"][0]["from"] == 7
 
 
-def test_the_command_says_the_protocol(
-    program: ModuleType, place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(program, "RESULTS", tmp_path)
-    run(program, place, tmp_path / "kept", resume=False)
-    (path,) = tmp_path.glob("*.json")
-    command = json.loads(path.read_text())["command"]
+def test_the_command_says_the_protocol(program: ModuleType, place: Path, tmp_path: Path) -> None:
+    (record,) = run(program, place, tmp_path / "kept", tmp_path)
+    command = record["command"]
     assert command[command.index("--protocol") + 1] == "builtin8"
 
 

@@ -15,8 +15,8 @@ from gridreg.errors import InputError
 from gridreg.scenes import builtin_scene
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
-from speed import common, machine, main, roofline, situations
-from speed.work import PARTS, Work
+from timing import common, machine, main, roofline, situations
+from timing.work import PARTS, Work
 
 from tests.speed_runs import COUNTS
 
@@ -91,8 +91,7 @@ def test_roofline(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str
         "train.weight_bound=0.001",
     ]
     assert main.main(words) == 0
-    (stored,) = tmp_path.glob("roofline-*.json")
-    record = json.loads(stored.read_text())
+    record = json.loads((tmp_path / "speed.jsonl").read_text())
     (one,) = record["situations"]
     assert list(one["rows"]) == list(PARTS)
     assert 0 < one["share"] <= one["share_with_caches"]

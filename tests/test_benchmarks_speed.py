@@ -17,8 +17,8 @@ from gridreg.scenes import builtin_scene
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 import overhead
-from speed import common, main, whole_run
-from speed.ball import ball_step
+from timing import common, main, whole_run
+from timing.ball import ball_step
 
 from tests.speed_runs import SMALL, TINY, one_thread, run
 
@@ -73,7 +73,7 @@ def test_scaling(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_threads_to_try() -> None:
-    from speed.scaling import powers_up_to
+    from timing.scaling import powers_up_to
 
     assert [powers_up_to(n) for n in (1, 2, 6, 8)] == [[1], [1, 2], [1, 2, 4, 6], [1, 2, 4, 8]]
 
@@ -246,7 +246,8 @@ def test_the_ball_is_opaque_and_not_fog() -> None:
 def test_overhead_of_an_open_composition(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["--rays", "32", "--edge", "10", "--repeats", "2", "--threads", "1"]
     assert overhead.main([*words, "--results", str(tmp_path)]) == 0
-    stored = json.loads((tmp_path / "vm-10-1threads.json").read_text())
+    (stored,) = map(json.loads, (tmp_path / "overhead.jsonl").read_text().splitlines())
+    assert stored["name"] == "vm-10-1threads"
     assert set(stored["ratios"]) == {"bare again", "masks open", "masks half-way"}
     assert stored["colour_samples_per_ray"] > 1
     assert "masks open / bare" in capsys.readouterr().out

@@ -17,8 +17,8 @@ from gridreg.scenes import builtin_scene
 from gridreg.training import build_trainer, save_run
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
-from speed import common, main, peer, situations, step
-from speed.stopwatch import STAGES, Stopwatch, places_of, watched_step
+from timing import common, main, peer, situations, step
+from timing.stopwatch import STAGES, Stopwatch, places_of, watched_step
 
 from tests.speed_runs import SMALL, TINY, one_thread, run
 
@@ -199,7 +199,7 @@ def test_stages_add_up_and_leave_no_trace(trainer: Any) -> None:
 
 def test_a_stage_within_another_stops_its_clock(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = iter([0.0, 1.0, 4.0, 10.0])
-    monkeypatch.setattr("speed.stopwatch.time.perf_counter", lambda: next(clock))
+    monkeypatch.setattr("timing.stopwatch.time.perf_counter", lambda: next(clock))
     watch = Stopwatch()
     inner = watch.timed(lambda: None, "march")
     watch.timed(inner, "density/part")()
@@ -218,7 +218,7 @@ def test_a_stage_that_fails_is_still_left() -> None:
 
 
 def common_place(owner: Any) -> Any:
-    from speed.stopwatch import Place
+    from timing.stopwatch import Place
 
     return Place(owner, "call", "rays")
 

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
-from speed.work import PARTS, density_work, encoding_operations, layer_operations_backward, work
+from timing.work import PARTS, density_work, encoding_operations, layer_operations_backward, work
 
 from tests.speed_runs import COUNTS
 
