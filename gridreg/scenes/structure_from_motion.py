@@ -13,7 +13,7 @@ from typing import Any
 
 # Fraction of the images above which a second attempt is not worth its time.
 _ENOUGH = 0.9
-# Of adjusting and finding points anew: on the images of benchmarks/own_pictures.py a third changes nothing any more.
+# Of adjusting and finding points anew: on the images of benchmarks/own_photographs.py a third changes nothing any more.
 _ROUNDS = 2
 
 STAGES = ("features", "matches", "cameras")
