@@ -51,7 +51,8 @@ def command(study: Path, out: Path, workers: int) -> list[str]:
 
 
 def finished(out: Path) -> int:
-    return len(list(out.glob("runs/*/result.json")))
+    """Runs that the store has as done; none before there is a store."""
+    return Store.open(out, create=False).counts()["done"] if (out / "store.sqlite").is_file() else 0
 
 
 def main() -> int:

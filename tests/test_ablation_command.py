@@ -193,12 +193,10 @@ def test_the_table_is_refused_before_hours_of_work(tmp_path, quick_runs):
     assert not (tmp_path / "out").exists()
 
 
-def test_the_default_folder_and_the_note(tmp_path, quick_runs, monkeypatch, capsys):
+def test_the_default_folder(tmp_path, quick_runs, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(Store, "note", "slow disk")
     assert run(options(write_study(tmp_path, rows="[none]"))) == 0
     assert (tmp_path / "outputs" / "tiny" / "store.sqlite").is_file()
-    assert "note: slow disk" in capsys.readouterr().err
 
 
 def test_the_report_is_written_on_request(tmp_path, quick_runs, monkeypatch, capsys):

@@ -111,7 +111,7 @@ def test_plain_data_and_back(config, test):
 
 
 def test_plain_data_of_something_else_are_refused():
-    with pytest.raises(InputError, match="expected the keys of a RunSpec"):
+    with pytest.raises(InputError, match="run: scene: missing, expected text or null"):
         RunSpec.from_json({"label": "x"})
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import signal
@@ -13,9 +14,12 @@ from pathlib import Path
 import pytest
 import torch
 
+from gridreg.ablation import perform as performing
 from gridreg.ablation import runners
+from gridreg.ablation import store as store_module
 from gridreg.ablation.claims import ClaimLostError
-from gridreg.ablation.perform import LOG_NAME, Scenes, describe_machine, locate_scene, perform, reason_of
+from gridreg.ablation.database import DiskFullError
+from gridreg.ablation.perform import LOG_NAME, Scenes, describe_machine, locate_scene, perform
 from gridreg.ablation.processes import Processes
 from gridreg.ablation.runners import InProcess
 from gridreg.ablation.store import Store
@@ -26,6 +30,7 @@ from gridreg.errors import InputError
 from gridreg.scenes import builtin_scene
 from gridreg.training import execute
 from gridreg.training.checkpoint import has_checkpoint
+from gridreg.training.files import output_errors
 from tests.ablation_runs import assert_same_numbers, tiny_study, write_study
 
 ROOT = Path(__file__).parents[1]
@@ -117,7 +122,7 @@ def test_an_unforeseen_error_is_kept_with_its_traceback(store, monkeypatch):
     def broken(*arguments, **options):
         raise ZeroDivisionError("by\nzero")
 
-    monkeypatch.setattr(runners, "perform", broken)
+    monkeypatch.setattr(performing, "execute", broken)
     study = tiny_study(rows="[none]")
     store.add(study)
     (claim_folder,) = [store.run_folder(h) for h in study.hashes]
@@ -131,17 +136,24 @@ def test_an_unforeseen_error_is_kept_with_its_traceback(store, monkeypatch):
 def test_a_claim_that_is_lost_ends_the_run(store, monkeypatch):
     study, events = tiny_study(rows="[none]"), []
     store.add(study)
-
-    def lost(*arguments, **options):
-        raise ClaimLostError("x")
-
     claim = store.claim(Worker.current())
-    monkeypatch.setattr(runners, "perform", lost)
-    runners.work_on(store, claim, Scenes(store.folder / "scenes"), events.append)
-    assert kinds(events) == ["started", "lost"]
     claim.lost.set()
     with pytest.raises(ClaimLostError):
         perform(claim.spec, claim.folder, Scenes(store.folder / "scenes"), watch=claim.check)
+    store.release(claim)
+    taken = []
+
+    def given_to_another(spec, folder, scenes, *, watch, log):
+        if not taken:
+            taken.append(1)
+            raise ClaimLostError("x")
+        return perform(spec, folder, scenes, watch=watch, log=log)
+
+    monkeypatch.setattr(runners, "perform", given_to_another)
+    # The other one gives it back.
+    monkeypatch.setattr(runners.time, "sleep", lambda seconds: store.mark_lost(Worker.current(), "x"))
+    InProcess().run(store, study, events.append)
+    assert kinds(events) == ["started", "lost", "started", "done"]
 
 
 def test_ctrl_c_saves_and_the_next_go_resumes(store, expected):
@@ -208,12 +220,40 @@ def test_scenes_on_other_machines(tmp_path, monkeypatch):
     assert locate_scene(str(tmp_path / "chair")) == tmp_path / "chair"
 
 
-def test_reasons(tmp_path):
-    assert reason_of(InputError("one line"), tmp_path) == "one line"
-    assert list(tmp_path.iterdir()) == []
-    assert reason_of(KeyError("a"), tmp_path) == "KeyError: 'a' (see log.txt)"
-    assert reason_of(ValueError("b"), tmp_path) == "ValueError: b (see log.txt)"
-    assert (tmp_path / LOG_NAME).read_text().count("Error: ") == 2
+def test_a_full_disk_pauses_the_study(store, monkeypatch, expected):
+    """No run has failed: the same command goes on when there is space."""
+    study, events = tiny_study(rows="[none, tensorf]"), []
+    store.add(study)
+    original = performing.execute
+
+    def full(*arguments, **options):
+        with output_errors("somewhere"):
+            raise OSError(errno.ENOSPC, "no space")
+
+    monkeypatch.setattr(performing, "execute", full)
+    with pytest.raises(DiskFullError, match=r"no space left on the disk.*; the study is paused"):
+        InProcess().run(store, study, events.append)
+    assert store.counts() == {"waiting": 2, "running": 0, "done": 0, "failed": 0}
+    monkeypatch.setattr(performing, "execute", original)
+    monkeypatch.setattr(store_module, "write_json", full)
+    with pytest.raises(DiskFullError):
+        InProcess().run(store, study, events.append)
+    assert store.counts()["waiting"] == 2
+    monkeypatch.undo()
+    InProcess().run(store, study, events.append)
+    assert images(store) == {h: expected[h] for h in study.hashes}
+
+
+def test_a_full_disk_pauses_processes(store, monkeypatch):
+    study = tiny_study(rows="[none]")
+    store.add(study)
+    script = store.folder / "full.sh"
+    script.write_text("#!/bin/sh\nexit 3\n")
+    script.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(script))
+    with pytest.raises(DiskFullError, match="the study is paused"):
+        Processes(workers=1).run(store, study, lambda event: None)
+    assert store.counts()["waiting"] == 1
 
 
 def test_a_worker_by_hand(store, expected, capsys):
@@ -282,7 +322,7 @@ def test_killed_and_gone_on_with(tmp_path, cache, expected):
     try:
         while time.monotonic() < end and not list(out.glob("runs/*/result.json")):
             time.sleep(0.02)
-        # The result comes first, then its row in the database; a kill between the two has a test of its own.
+        # The copy comes first, then the row in the database.
         while time.monotonic() < end and not Store.open(out, create=False).counts()["done"]:
             time.sleep(0.02)
     finally:

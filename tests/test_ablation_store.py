@@ -17,10 +17,9 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
-from gridreg.ablation import transitions
-from gridreg.ablation.claims import LEASE_SECONDS, Claim, ClaimLostError, Heartbeat
-from gridreg.ablation.database import APPLICATION_ID, SCHEMA_VERSION, Database, network_file_system
-from gridreg.ablation.store import Store
+from gridreg.ablation.claims import LEASE_SECONDS, Claim, ClaimLostError, heartbeat
+from gridreg.ablation.database import APPLICATION_ID, SCHEMA_VERSION, Database, DiskFullError
+from gridreg.ablation.store import MOST_LOSSES, Store
 from gridreg.ablation.workers import Worker
 from gridreg.errors import InputError
 from tests.ablation_runs import metrics, spec, study_of
@@ -142,7 +141,7 @@ def test_a_run_given_back_waits(store):
     for word in (
         lambda: finish(store, claim),
         lambda: store.fail(claim, "x"),
-        lambda: store.lose_claim(claim, "x"),
+        lambda: store.mark_lost(claim, "x"),
     ):
         claim.lost.clear()
         with pytest.raises(ClaimLostError):
@@ -186,30 +185,33 @@ def test_a_worker_elsewhere_is_dead_when_it_is_silent(store):
 
 def test_a_run_that_takes_its_process_down_fails_in_the_end(store):
     store.add(study_of(spec("a")))
-    for number in range(1, transitions.MOST_LOSSES + 1):
+    for number in range(1, MOST_LOSSES + 1):
         assert store.counts()["failed"] == 0
         claim = claimed(store)
         if number == 2:
-            store.lose_claim(claim, "signal 9")
+            store.mark_lost(claim, "signal 9")
         else:
-            store.lose(HERE, "signal 9")
+            store.mark_lost(HERE, "signal 9")
     (result,) = store.results()
     assert (result.status, result.reason) == ("failed", "took its process down 3 times (last: signal 9)")
     store.retry()
-    store.lose_claim(claimed(store), "signal 9")
+    store.mark_lost(claimed(store), "signal 9")
     assert store.counts()["waiting"] == 1
 
 
-def test_a_result_without_its_entry_counts(store):
-    """Killed between the result's file and the database."""
+def test_the_database_is_the_truth_and_not_the_copy(store):
+    """Killed between the result's copy and the database: the run is not finished, and goes to the next worker."""
     store.add(study_of(spec("a"), spec("b")))
     finish(store, claimed(store))
     with sqlite3.connect(store.folder / "store.sqlite") as connection:
-        connection.execute("UPDATE runs SET status='running', worker=?, metrics=NULL", (DEAD.to_text(),))
+        connection.execute(
+            "UPDATE runs SET status='running', worker=?, metrics=NULL WHERE status='done'", (DEAD.to_text(),)
+        )
     connection.close()
-    assert claimed(store).spec.label == "b"
-    assert store.results()[0].status == "done"
-    assert store.results()[0].metrics == metrics()
+    claim = claimed(store)
+    assert claim.spec.label == "a"
+    finish(store, claim, 22.0)
+    assert store.results()[0].metrics == metrics(22.0)
 
 
 def test_a_lost_database_is_made_again_from_the_runs(store):
@@ -434,49 +436,70 @@ def test_other_errors_of_sqlite(store, monkeypatch, text, expected):
         raise sqlite3.OperationalError(text)
 
     monkeypatch.setattr(sqlite3, "connect", broken)
-    with pytest.raises(InputError, match=expected):
+    with pytest.raises(InputError, match=expected) as caught:
         store.results()
+    assert isinstance(caught.value, DiskFullError) == ("full" in text)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        "UPDATE runs SET spec='nonsense'",
+        "UPDATE runs SET spec='[]'",
+        """UPDATE runs SET spec=replace(spec, '"seed": 0', '"seed": "0"')""",
+        """UPDATE runs SET spec=replace(spec, '"seed"', '"sead"')""",
+        "UPDATE runs SET spec=x'ff00'",
+        "UPDATE runs SET worker='{}', status='running'",
+        "UPDATE runs SET worker='5', status='running'",
+        "UPDATE runs SET worker=NULL, status='running'",
+        "UPDATE runs SET metrics='5', status='done'",
+        """UPDATE runs SET metrics='{"mean": {"psnr": "much"}}', status='done'""",
+        """UPDATE runs SET metrics='{"mean": 3}', status='done'""",
+        "UPDATE runs SET metrics=CAST(x'22ff22' AS TEXT)",
+        "UPDATE runs SET seconds='soon'",
+        "UPDATE studies SET modules='x'",
+        "UPDATE studies SET modules='[1]'",
+        "UPDATE members SET label=x'00'",
+        "ALTER TABLE runs DROP COLUMN seconds",
+    ],
+)
+def test_content_that_is_damaged(store, damage):
+    """SQLite checks its pages, not what stands in them."""
+    study = study_of(spec("a"))
+    store.add(study)
+    with sqlite3.connect(store.folder / "store.sqlite") as connection:
+        connection.execute(damage)
+    connection.close()
+
+    def use():
+        again = Store.open(store.folder, create=False)
+        again.studies()
+        again.results(study)
+        again.counts()
+        again.export(store.folder / "table.csv")
+
+    with pytest.raises(InputError, match=r"store\.sqlite: ") as caught:
+        use()
+    assert str(caught.value).isprintable()
 
 
 def test_marks_of_the_file(store):
     connection = sqlite3.connect(store.folder / "store.sqlite")
     assert connection.execute("PRAGMA application_id").fetchone() == (APPLICATION_ID,)
-    assert connection.execute("PRAGMA journal_mode").fetchone() == ("wal",)
-    connection.close()
-    assert store.note == ""
-
-
-def test_network_file_systems(tmp_path):
-    mounts = tmp_path / "mounts"
-    mounts.write_text(
-        "/dev/a / ext4 rw 0 0\nserver:/x /data nfs4 rw 0 0\n/dev/b /data/local\\040disk xfs rw 0 0\nshort\n"
-    )
-
-    def kind(path):
-        return network_file_system(Path(path), mounts)
-
-    assert kind("/data/study") == "nfs4"
-    assert kind("/data") == "nfs4"
-    assert kind("/data/local disk/study") == ""
-    assert kind("/database") == ""
-    assert network_file_system(tmp_path, tmp_path / "none") == ""
-
-
-def test_a_network_file_system_is_said(tmp_path, monkeypatch):
-    monkeypatch.setattr("gridreg.ablation.database.network_file_system", lambda folder: "nfs4")
-    store = Store.open(tmp_path / "store")
-    assert "network file system (nfs4)" in store.note
-    store.add(study_of(spec("a")))
-    finish(store, claimed(store))
-    connection = sqlite3.connect(store.folder / "store.sqlite")
+    # A write-ahead log would not work on a network file system.
     assert connection.execute("PRAGMA journal_mode").fetchone() == ("delete",)
     connection.close()
 
 
-def test_a_file_system_without_shared_memory_is_said(tmp_path, monkeypatch):
-    """SQLite answers with the journal that it keeps."""
-    monkeypatch.setattr(Database, "_patiently", lambda self, connection, statement: "delete")
-    assert "has no write-ahead log for SQLite; using journal delete" in Store.open(tmp_path / "store").note
+def test_a_store_with_a_write_ahead_log_goes_on(store):
+    """As stores were made once."""
+    store.add(study_of(spec("a"), spec("b")))
+    connection = sqlite3.connect(store.folder / "store.sqlite")
+    assert connection.execute("PRAGMA journal_mode=WAL").fetchone() == ("wal",)
+    connection.close()
+    again = Store.open(store.folder, create=False)
+    finish(again, claimed(again))
+    assert again.counts() == {"waiting": 1, "running": 0, "done": 1, "failed": 0}
 
 
 def test_workers_are_told_apart(tmp_path, monkeypatch):
@@ -501,11 +524,8 @@ def test_a_heartbeat_finds_out_that_its_claim_is_lost():
             raise InputError("locked for a moment")
         return holds[claim.token]
 
-    with Heartbeat(beat, every=0.01) as heartbeat:
-        for claim in claims.values():
-            heartbeat.add(claim)
-        heartbeat.drop(claims["dropped"])
-        heartbeat.drop(claims["dropped"])
+    with heartbeat(beat, claims.values(), every=0.01):
+        del claims["dropped"]
         assert claims["lost"].lost.wait(10)
     assert "kept" in beats
     assert not claims["kept"].lost.is_set()

@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
 
 from gridreg.ablation.records import RunSpec
 from gridreg.errors import InputError
 
-__all__ = ["HEARTBEAT_SECONDS", "LEASE_SECONDS", "Claim", "ClaimLostError", "Heartbeat"]
+__all__ = [
+    "HEARTBEAT_SECONDS",
+    "LEASE_SECONDS",
+    "Claim",
+    "ClaimLostError",
+    "heartbeat",
+]
 
 HEARTBEAT_SECONDS = 10.0
 """Between two signs of life of a worker."""
@@ -51,44 +57,31 @@ class Claim:
             raise ClaimLostError(f"{self.spec.describe()}: given to another worker")
 
 
-class Heartbeat:
-    """Signs of life for some claims from a thread of its own, while the block runs.
+@contextmanager
+def heartbeat(
+    beat: Callable[[Claim], bool], claims: Collection[Claim], every: float = HEARTBEAT_SECONDS
+) -> Iterator[None]:
+    """Signs of life for claims, from a thread of its own, while the block runs.
 
     Args:
         beat: tells the store; returns whether the claim still holds.
+        claims: kept alive; the block may add to them and take away.
         every: seconds between two signs.
     """
+    over = threading.Event()
 
-    def __init__(self, beat: Callable[[Claim], bool], every: float = HEARTBEAT_SECONDS) -> None:
-        self._beat = beat
-        self._every = every
-        self._claims: list[Claim] = []
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._work, name="heartbeat", daemon=True)
-
-    def __enter__(self) -> Heartbeat:
-        self._thread.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._over.set()
-        self._thread.join()
-
-    def add(self, claim: Claim) -> None:
-        """Keep a claim alive."""
-        self._claims.append(claim)
-
-    def drop(self, claim: Claim) -> None:
-        """Keep it alive no longer."""
-        with contextlib.suppress(ValueError):
-            self._claims.remove(claim)
-
-    def _work(self) -> None:
-        while not self._over.wait(self._every):
-            for claim in list(self._claims):
+    def work() -> None:
+        while not over.wait(every):
+            for claim in tuple(claims):
                 # A store that is locked for a moment is asked again with the next beat.
                 with contextlib.suppress(InputError):
-                    if not self._beat(claim):
+                    if not beat(claim):
                         claim.lost.set()
+
+    thread = threading.Thread(target=work, name="heartbeat", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()

@@ -69,8 +69,6 @@ def run(options: AblationOptions) -> int:
         raise InputError(f"--export: found {options.export}, expected a name that ends in .csv or .parquet")
     runner = make_runner(options)
     store = Store.open(out)
-    if store.note:
-        print(f"note: {store.note}", file=sys.stderr)
     store.add(study)
     if options.retry_failed:
         print(f"failed runs that are tried again: {store.retry(study)}", file=sys.stderr)

@@ -1,17 +1,22 @@
-"""One run of a study, from its claim to its result."""
+"""One run of a study, from its specification to its result."""
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import os
 import platform
 import sys
 import traceback
 from collections import OrderedDict
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from gridreg.ablation.claims import ClaimLostError
+from gridreg.ablation.database import DiskFullError
 from gridreg.ablation.records import RunSpec
 from gridreg.ablation.study import DATA_VARIABLE
 from gridreg.errors import InputError
@@ -19,10 +24,18 @@ from gridreg.scenes import Scene, builtin_scene, load_scene
 from gridreg.training import RunConfig, execute
 from gridreg.training.checkpoint import has_checkpoint, load_checkpoint
 from gridreg.training.config import from_data
-from gridreg.training.files import check_output_folder, output_errors, remove_folder, write_text
+from gridreg.training.files import check_output_folder, output_errors, remove_folder
 from gridreg.training.versions import cpu_model
 
-__all__ = ["LOG_NAME", "Outcome", "Scenes", "describe_machine", "perform", "reason_of", "scene_key"]
+__all__ = [
+    "LOG_NAME",
+    "Scenes",
+    "TaskResult",
+    "describe_machine",
+    "is_disk_full",
+    "perform",
+    "scene_key",
+]
 
 LOG_NAME = "log.txt"
 """File in a run's folder with what the run printed, and the traceback of an error."""
@@ -31,18 +44,24 @@ _KEPT = 2
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """What came of a run.
+class TaskResult:
+    """What came of a run; with neither metrics nor a reason, it was interrupted.
 
     Args:
-        metrics: as `gridreg.training.execute` returned them; None if the run was interrupted.
-        fingerprint: of the scene.
+        metrics: as `gridreg.training.execute` returned them.
+        reason: of a failure, one line.
+        disk_full: whether it failed for want of space.
         machine: that computed it.
+        fingerprint: of the scene.
+        files: of the run's folder by path in it, where it was done on another machine.
     """
 
-    metrics: dict[str, Any] | None
-    fingerprint: str
-    machine: str
+    metrics: dict[str, Any] | None = None
+    reason: str = ""
+    disk_full: bool = False
+    machine: str = ""
+    fingerprint: str = ""
+    files: dict[str, bytes] = field(default_factory=dict)
 
 
 class Scenes:
@@ -83,12 +102,12 @@ class Scenes:
 
 
 def scene_key(spec: RunSpec) -> tuple[Any, ...]:
-    """What tells two opened scenes apart."""
+    """All that tells two opened scenes apart."""
     return (spec.scene, spec.protocol, spec.size, spec.test)
 
 
 def locate_scene(path: str) -> Path:
-    """Where a scene lies on this machine: at its path, or by the end of its path below the folder in GRIDREG_DATA.
+    """The folder of a scene on this machine: its path, or the end of its path below the folder in GRIDREG_DATA.
 
     Raises:
         InputError: if it is at neither.
@@ -114,43 +133,39 @@ def perform(
     folder: Path,
     scenes: Scenes,
     *,
-    keep_checkpoint: bool = True,
-    watch: Callable[[], None] | None = None,
-) -> Outcome:
-    """Train and score a run in its folder; goes on from the checkpoint that stands there.
+    watch: Callable[[], None] = lambda: None,
+    log: bool = False,
+) -> TaskResult:
+    """Train and score a run in its folder, from the checkpoint that stands there; what goes wrong is in the result.
 
     Args:
         spec: what to run.
         folder: where.
         scenes: opens the scene.
-        keep_checkpoint: leave the checkpoint of a finished run there.
-        watch: called at every iteration; an exception from it ends the run.
+        watch: called at every iteration; it may end the run by raising `ClaimLostError`.
+        log: what the run prints goes to its folder instead of the terminal.
 
     Raises:
-        InputError: for an unusable scene or folder, or a training that has died.
+        ClaimLostError: if ``watch`` raised it.
     """
-    scene = scenes.get(spec)
-    path = spec.scene if spec.scene is None else str(locate_or_keep(spec.scene))
-    config = replace(from_data(RunConfig, spec.config, source=spec.describe()), scene=path)
-    check_output_folder(folder)
-    resume = _usable(folder / "checkpoint", scene)
-
-    def on_step(_: Any) -> None:
-        if watch is not None:
-            watch()
-
-    _, metrics = execute(config, scene, folder, resume=resume, command=sys.argv, on_step=on_step)
-    if metrics is not None and not keep_checkpoint:
-        remove_folder(folder / "checkpoint")
-    return Outcome(metrics, scene.fingerprint, describe_machine())
-
-
-def locate_or_keep(path: str) -> Path:
-    """Where a scene lies on this machine, or its path elsewhere if it was shipped."""
     try:
-        return locate_scene(path)
-    except InputError:
-        return Path(path)
+        with _printing_to(folder) if log else contextlib.nullcontext():
+            scene, path = scenes.get(spec), spec.scene
+            if path is not None:
+                # A scene that was shipped lies nowhere here.
+                with contextlib.suppress(InputError):
+                    path = str(locate_scene(path))
+            config = replace(from_data(RunConfig, spec.config, source=spec.describe()), scene=path)
+            check_output_folder(folder)
+            resume = _usable(folder / "checkpoint", scene)
+            _, metrics = execute(
+                config, scene, folder, resume=resume, command=sys.argv, on_step=lambda report: watch()
+            )
+            return TaskResult(metrics, machine=describe_machine(), fingerprint=scene.fingerprint)
+    except ClaimLostError:
+        raise
+    except Exception as error:
+        return TaskResult(reason=_reason_of(error, folder), disk_full=is_disk_full(error))
 
 
 def describe_machine() -> str:
@@ -163,21 +178,34 @@ def describe_machine() -> str:
     return f"{platform.node()} ({cpu_model()})"
 
 
-def reason_of(error: BaseException, folder: Path) -> str:
-    """One line for the store; what the line leaves out goes to the run's log.
+def is_disk_full(error: BaseException | None) -> bool:
+    """Whether an error, or what caused it, says that there is no space left."""
+    while error is not None:
+        if isinstance(error, DiskFullError):
+            return True
+        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
 
-    Args:
-        error: that ended the run.
-        folder: of the run.
-    """
+
+def _reason_of(error: Exception, folder: Path) -> str:
+    """One line for the store; where it leaves something out, the traceback goes to the run's log."""
     if isinstance(error, InputError):
         return str(error)
-    text = "".join(traceback.format_exception(error))
-    log = folder / LOG_NAME
-    with output_errors(log):
-        before = log.read_text(encoding="utf-8", errors="replace") if log.is_file() else ""
-    write_text(log, before + text)
+    with contextlib.suppress(OSError), (folder / LOG_NAME).open("a", encoding="utf-8") as stream:
+        stream.write("".join(traceback.format_exception(error)))
     return f"{type(error).__name__}: {str(error).partition(chr(10))[0]} (see {LOG_NAME})"
+
+
+@contextmanager
+def _printing_to(folder: Path) -> Iterator[None]:
+    """A block whose output goes to the log of the run in ``folder``."""
+    with output_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        stream = (folder / LOG_NAME).open("a", encoding="utf-8")
+    with stream, contextlib.redirect_stderr(stream), contextlib.redirect_stdout(stream):
+        yield
 
 
 def _usable(checkpoint: Path, scene: Scene) -> bool:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import os
+import secrets
 import socket
-import time
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -14,31 +16,32 @@ from gridreg.errors import InputError
 
 __all__ = ["ANSWER_SECONDS", "check_answers", "connected", "import_ray"]
 
-ANSWER_SECONDS = 5.0
+ANSWER_SECONDS = 20.0
 """How long an address may take to answer."""
-
-# HTTP/2 (RFC 9113): the types of frames that matter here, and the flags that end headers and a stream.
-_DATA, _HEADERS, _SETTINGS = 0, 1, 4
-_END_STREAM, _END_HEADERS = 1, 4
-_STATUS_200 = 0x88
 
 
 def import_ray(address: str | None = None) -> Any:
     """The module ``ray``.
 
     Args:
-        address: that it is going to connect to.
+        address: that it is going to connect to; None: a cluster of this machine's own, which nobody else shall reach.
 
     Raises:
         InputError: if it is not installed.
     """
     # Ray would tell its makers about the cluster otherwise, and waits for them when there is no network.
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    settings = {"RAY_USAGE_STATS_ENABLED": "0"}
     # Ray warns of a change to come otherwise; tasks here ask for no accelerator.
-    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
-    if address is not None:
-        # Ray asks once a second, by default for twenty.
-        os.environ.setdefault("RAY_NUM_REDIS_GET_RETRIES", "8")
+    settings["RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO"] = "0"
+    if address is None:
+        # Whoever reaches Ray's ports runs what they like here. Without clusters, which Ray allows by default on Linux
+        # only, it listens on the loopback interface alone; there it asks other users for the token.
+        settings["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
+        settings["RAY_AUTH_MODE"] = "token"
+        if "RAY_AUTH_TOKEN_PATH" not in os.environ:
+            settings["RAY_AUTH_TOKEN"] = secrets.token_hex(32)
+    for name, value in settings.items():
+        os.environ.setdefault(name, value)
     try:
         import ray
     except ImportError as error:
@@ -67,9 +70,8 @@ def connected(address: str | None, cpus: int) -> Iterator[Any]:
     if address is None:
         options |= {"address": "local", "num_cpus": cpus, "include_dashboard": False}
     else:
-        place = _find(ray) if address == "auto" else address
-        check_answers(place)
-        options["address"] = place
+        options["address"] = _find(ray) if address == "auto" else address
+        check_answers(options["address"])
     try:
         ray.init(**options)
     except (ConnectionError, RuntimeError, ValueError, OSError, TimeoutError) as error:
@@ -84,82 +86,27 @@ def connected(address: str | None, cpus: int) -> Iterator[Any]:
 
 
 def check_answers(address: str, seconds: float = ANSWER_SECONDS) -> None:
-    """Make sure that something answers at an address that speaks Ray's protocol.
+    """Make sure that a Ray cluster answers: ``ray.init`` itself would try for minutes, and print as it does.
 
     Args:
         address: ``HOST:PORT`` or ``ray://HOST:PORT``.
         seconds: to wait at most.
 
     Raises:
-        InputError: if nothing does.
+        InputError: if none does.
     """
     host, colon, port = address.removeprefix("ray://").rpartition(":")
     if not colon or not port.isdecimal() or not 0 < int(port) < 65536:
         raise InputError(f"--address: found {address!r}, expected auto, HOST:PORT or ray://HOST:PORT")
-    end = time.monotonic() + seconds
     try:
-        with socket.create_connection((host.strip("[]"), int(port)), timeout=seconds) as connection:
-            # With TLS the greeting would have to be encrypted; that the port is open must do.
-            if os.environ.get("RAY_USE_TLS", "0") != "1":
-                _greet(connection, end)
-    except OSError as error:
-        reason = "no answer" if isinstance(error, TimeoutError) else error.strerror or str(error)
+        socket.create_connection((host.strip("[]"), int(port)), timeout=seconds).close()
+        if not address.startswith("ray://"):
+            # Of Ray's client server, which has no health check, an open port must do.
+            command = [sys.executable, "-m", "ray.scripts.scripts", "health-check", "--address", address]
+            subprocess.run(command, capture_output=True, timeout=seconds, check=True)
+    except (OSError, subprocess.SubprocessError) as error:
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else "no answer"
         raise InputError(f"--address: no Ray cluster answers at {address} ({reason})") from error
-
-
-def _greet(connection: socket.socket, end: float) -> None:
-    """Ask for its health, as every gRPC server lets one: Ray itself would try for long, and print as it does."""
-    connection.sendall(
-        b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n"
-        + _frame(_SETTINGS, 0, 0, b"")
-        + _frame(_HEADERS, _END_HEADERS, 1, _question())
-        + _frame(_DATA, _END_STREAM, 1, bytes(5))
-    )
-    kind, content = -1, b""
-    while kind != _HEADERS:
-        head = _receive(connection, 9, end)
-        kind, length = head[3], int.from_bytes(head[:3], "big")
-        if length > 1 << 14:
-            raise OSError(0, "another program listens there")
-        content = _receive(connection, length, end)
-    # The status is the first header; it stands in the table that every HTTP/2 program knows (RFC 7541).
-    if content[:1] != bytes([_STATUS_200]):
-        raise OSError(0, "another program listens there")
-
-
-def _question() -> bytes:
-    """Headers of a gRPC call, without Huffman codes."""
-
-    def text(value: bytes) -> bytes:
-        return bytes([len(value)]) + value
-
-    return (
-        bytes([0x83, 0x86])  # :method POST, :scheme http
-        + b"\x04"  # :path
-        + text(b"/grpc.health.v1.Health/Check")
-        + b"\x01"  # :authority
-        + text(b"ray")
-        + b"\x0f\x10"  # content-type
-        + text(b"application/grpc")
-        + b"\x00"
-        + text(b"te")
-        + text(b"trailers")
-    )
-
-
-def _frame(kind: int, flags: int, stream: int, content: bytes) -> bytes:
-    return len(content).to_bytes(3, "big") + bytes([kind, flags]) + stream.to_bytes(4, "big") + content
-
-
-def _receive(connection: socket.socket, count: int, end: float) -> bytes:
-    data = b""
-    while len(data) < count:
-        connection.settimeout(max(0.01, end - time.monotonic()))
-        part = connection.recv(count - len(data))
-        if not part:
-            raise OSError(0, "the connection was closed")
-        data += part
-    return data
 
 
 def _find(ray: Any) -> str:

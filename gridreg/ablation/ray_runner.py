@@ -7,13 +7,12 @@ import time
 from dataclasses import dataclass
 from typing import Any
 
-from gridreg.ablation.claims import Claim, ClaimLostError, Heartbeat
-from gridreg.ablation.packing import pack_folder, unpack_folder
-from gridreg.ablation.perform import Scenes, scene_key
+from gridreg.ablation.claims import Claim, ClaimLostError, heartbeat
+from gridreg.ablation.perform import Scenes, TaskResult, is_disk_full, scene_key
 from gridreg.ablation.ray_cluster import connected, import_ray
-from gridreg.ablation.ray_task import Order, Reply, carry_out
+from gridreg.ablation.ray_task import Task, read_folder, run_task, write_folder
 from gridreg.ablation.records import Study
-from gridreg.ablation.runners import Event, Report, finish_or_fail
+from gridreg.ablation.runners import Event, Kind, Report, settle
 from gridreg.ablation.store import Store
 from gridreg.ablation.workers import Worker
 from gridreg.cores import usable_cores
@@ -58,23 +57,20 @@ class RayRunner:
     def run(self, store: Store, study: Study, report: Report) -> None:
         """See `gridreg.ablation.runners.Runner.run`."""
         count = self.workers or max(1, usable_cores() // self.threads)
-        with connected(self.address, cpus=count * self.threads) as ray, Heartbeat(store.beat) as heartbeat:
-            desk = _Desk(self, ray, store, study, report, heartbeat)
+        with connected(self.address, cpus=count * self.threads) as ray:
+            queue = _Queue(self, ray, store, study, report)
             # Inside the connection, because connecting installs handlers of Ray's.
-            with interruptible() as interruption:
-                desk.work(interruption)
+            with interruptible() as interruption, heartbeat(store.beat, queue.pending.values()):
+                queue.work(interruption)
         if interruption.requested:
             raise KeyboardInterrupt
 
 
-class _Desk:
+class _Queue:
     """Hands out runs and takes results in."""
 
-    def __init__(
-        self, runner: RayRunner, ray: Any, store: Store, study: Study, report: Report, heartbeat: Heartbeat
-    ) -> None:
-        self.runner, self.ray, self.store, self.study = runner, ray, store, study
-        self.report, self.heartbeat = report, heartbeat
+    def __init__(self, runner: RayRunner, ray: Any, store: Store, study: Study, report: Report) -> None:
+        self.runner, self.ray, self.store, self.study, self.report = runner, ray, store, study, report
         self.worker = Worker.current()
         self.pending: dict[Any, Claim] = {}
         self.scenes = Scenes(store.folder / "scenes")
@@ -97,28 +93,22 @@ class _Desk:
             self._stop()
 
     def _hand_out(self) -> None:
-        while len(self.pending) < self._room():
+        while len(self.pending) < self._capacity():
             claim = self.store.claim(self.worker, self.study)
             if claim is None:
                 return
-            self.heartbeat.add(claim)
             self.report(Event("started", claim.spec))
+            runner, modules = self.runner, self.study.modules
             try:
-                order = Order(
-                    claim.spec.to_json(),
-                    pack_folder(claim.folder),
-                    self.runner.threads,
-                    self.runner.keep_checkpoints,
-                    self.study.modules,
-                )
-                scene = self._ship(claim) if self.runner.ship_scenes else []
+                files = read_folder(claim.folder)
+                scene = self._ship(claim) if runner.ship_scenes else []
             except InputError as error:
-                self.heartbeat.drop(claim)
-                finish_or_fail(self.store, claim, self.report, reason=str(error))
+                settle(self.store, claim, TaskResult(reason=str(error)), self.report)
                 continue
-            self.pending[self.task.remote(order, scene)] = claim
+            task = Task(claim.spec.to_json(), files, runner.threads, runner.keep_checkpoints, modules)
+            self.pending[self.task.remote(task, scene)] = claim
 
-    def _room(self) -> int:
+    def _capacity(self) -> int:
         """Runs that fit into the cluster as it is now."""
         if self.runner.workers is not None:
             return self.runner.workers
@@ -135,54 +125,37 @@ class _Desk:
         ready, _ = self.ray.wait(list(self.pending), num_returns=1, timeout=seconds)
         for reference in ready:
             claim = self.pending.pop(reference)
-            self.heartbeat.drop(claim)
             try:
-                self._settle(claim, reference)
+                self._take(claim, reference)
             except ClaimLostError:
                 self.report(Event("lost", claim.spec))
 
-    def _settle(self, claim: Claim, reference: Any) -> None:
+    def _take(self, claim: Claim, reference: Any) -> None:
         errors = self.ray.exceptions
         try:
-            reply: Reply = self.ray.get(reference)
+            result: TaskResult = self.ray.get(reference)
         except errors.TaskCancelledError:
-            self._give_back(claim, "interrupted")
+            result = TaskResult()
         except errors.RayTaskError as error:
             # The task itself catches what a run can raise; this is a worker that cannot even begin.
-            finish_or_fail(self.store, claim, self.report, reason=_line(error))
+            result = TaskResult(reason=_line(error))
         except (errors.WorkerCrashedError, errors.OutOfMemoryError) as error:
-            self.store.lose_claim(claim, _line(error))
+            self.store.mark_lost(claim, _line(error))
             self.report(Event("lost", claim.spec))
+            return
         except errors.RayError as error:
             # A node that went away is no fault of the run's.
             print(f"{claim.spec.describe()}: {_line(error)}", file=sys.stderr)
             self._give_back(claim, "lost")
-        else:
-            self._keep(claim, reply)
+            return
+        if result.files and self.store.beat(claim):
+            try:
+                write_folder(result.files, claim.folder)
+            except InputError as error:
+                result = TaskResult(reason=str(error), disk_full=is_disk_full(error))
+        settle(self.store, claim, result, self.report)
 
-    def _keep(self, claim: Claim, reply: Reply) -> None:
-        if not self.store.beat(claim):
-            self.report(Event("lost", claim.spec))
-            return
-        try:
-            unpack_folder(reply.files, claim.folder)
-        except InputError as error:
-            finish_or_fail(self.store, claim, self.report, reason=str(error))
-            return
-        if reply.metrics is None and not reply.reason:
-            self._give_back(claim, "interrupted")
-            return
-        finish_or_fail(
-            self.store,
-            claim,
-            self.report,
-            reason=reply.reason,
-            metrics=reply.metrics,
-            machine=reply.machine,
-            fingerprint=reply.fingerprint,
-        )
-
-    def _give_back(self, claim: Claim, outcome: Any) -> None:
+    def _give_back(self, claim: Claim, outcome: Kind) -> None:
         self.store.release(claim, outcome)
         self.report(Event(outcome, claim.spec))
 
@@ -196,15 +169,14 @@ class _Desk:
                 self._take_in(_POLL)
         finally:
             for claim in self.pending.values():
-                self.heartbeat.drop(claim)
                 self._give_back(claim, "interrupted")
             self.pending.clear()
 
 
-def _remote(order: Order, scene: list[Any]) -> Reply:
+def _remote(task: Task, scene: list[Any]) -> TaskResult:
     import ray
 
-    return carry_out(order, [lambda: ray.get(scene[0])] if scene else [])
+    return run_task(task, [lambda: ray.get(scene[0])] if scene else [])
 
 
 def _line(error: BaseException) -> str:

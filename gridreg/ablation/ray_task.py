@@ -1,96 +1,116 @@
-"""What a Ray worker does with one run: it needs gridreg and, unless scenes are shipped, the scene; not the store."""
+"""A run on a Ray worker: it needs gridreg and, unless scenes are shipped, the scene; not the store."""
 
 from __future__ import annotations
 
-import contextlib
+import atexit
+import functools
 import importlib
-import io
+import shutil
 import tempfile
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import torch
 
-from gridreg.ablation.packing import pack_folder, unpack_folder
-from gridreg.ablation.perform import LOG_NAME, Scenes, perform, reason_of
+from gridreg.ablation.perform import Scenes, TaskResult, perform
 from gridreg.ablation.records import RunSpec
+from gridreg.errors import InputError
 from gridreg.scenes import Scene
+from gridreg.training.files import output_errors, remove_folder
 
-__all__ = ["Order", "Reply", "carry_out"]
-
-_scenes: list[Scenes] = []
+__all__ = ["Task", "read_folder", "run_task", "write_folder"]
 
 
 @dataclass(frozen=True)
-class Order:
+class Task:
     """A run as it travels to a worker.
 
     Args:
         spec: `RunSpec.to_json`.
-        files: of the run's folder so far, see `gridreg.ablation.packing.pack_folder`; a checkpoint among them goes on.
+        files: of the run's folder so far; a checkpoint among them goes on.
         threads: of torch.
         keep_checkpoint: send back that of a finished run.
         modules: to import first.
     """
 
     spec: dict[str, Any]
-    files: bytes
+    files: dict[str, bytes]
     threads: int
     keep_checkpoint: bool
     modules: tuple[str, ...]
 
 
-@dataclass(frozen=True)
-class Reply:
-    """What a worker sends back.
-
-    Args:
-        metrics: of a finished run; None if it failed or was interrupted.
-        reason: of a failure; empty if it was interrupted.
-        files: of the run's folder.
-        machine: that worked.
-        fingerprint: of the scene.
-    """
-
-    metrics: dict[str, Any] | None
-    reason: str
-    files: bytes
-    machine: str = ""
-    fingerprint: str = ""
-
-
-def carry_out(order: Order, fetch_scene: Sequence[Callable[[], Scene]] = ()) -> Reply:
+def run_task(task: Task, fetch_scene: Sequence[Callable[[], Scene]] = ()) -> TaskResult:
     """Do a run in a temporary folder.
 
     Args:
-        order: the run.
+        task: the run.
         fetch_scene: gets the scene where it was shipped; nothing: it is found by path.
     """
-    torch.set_num_threads(order.threads)
-    spec = RunSpec.from_json(order.spec)
-    if not _scenes:
-        # One for the life of the worker process, because neighbouring runs share their scene.
-        _scenes.append(Scenes(Path(tempfile.gettempdir()) / "gridreg-scenes"))
+    torch.set_num_threads(task.threads)
+    spec = RunSpec.from_json(task.spec)
     with tempfile.TemporaryDirectory(prefix="gridreg-run-") as parent:
         folder = Path(parent) / "run"
-        unpack_folder(order.files, folder)
-        printed = io.StringIO()
+        write_folder(task.files, folder)
         try:
-            with contextlib.redirect_stderr(printed), contextlib.redirect_stdout(printed):
-                for module in order.modules:
-                    importlib.import_module(module)
-                for fetch in fetch_scene:
-                    _scenes[0].put(spec, fetch())
-                outcome = perform(spec, folder, _scenes[0], keep_checkpoint=order.keep_checkpoint)
+            for module in task.modules:
+                importlib.import_module(module)
+            for fetch in fetch_scene:
+                _worker_scenes().put(spec, fetch())
         except Exception as error:
-            _append_log(folder, printed.getvalue())
-            return Reply(None, reason_of(error, folder), pack_folder(folder))
-        _append_log(folder, printed.getvalue())
-        return Reply(outcome.metrics, "", pack_folder(folder), outcome.machine, outcome.fingerprint)
+            return TaskResult(reason=f"{type(error).__name__}: {error}", files=task.files)
+        result = perform(spec, folder, _worker_scenes(), log=True)
+        if result.metrics is not None and not task.keep_checkpoint:
+            remove_folder(folder / "checkpoint")
+        return replace(result, files=read_folder(folder))
 
 
-def _append_log(folder: Path, text: str) -> None:
-    with (folder / LOG_NAME).open("a", encoding="utf-8") as log:
-        log.write(text)
+@functools.cache
+def _worker_scenes() -> Scenes:
+    """Scenes for the life of the worker process, because neighbouring runs share theirs."""
+    # Not a name that another user could know and take first.
+    folder = tempfile.mkdtemp(prefix="gridreg-scenes-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return Scenes(Path(folder))
+
+
+def read_folder(folder: Path) -> dict[str, bytes]:
+    """Every file below a folder, by its path in it; nothing if there is no folder.
+
+    Raises:
+        InputError: if a file cannot be read.
+    """
+    found = {}
+    for path in sorted(folder.rglob("*")):
+        if path.is_file() and not path.is_symlink():
+            try:
+                found[path.relative_to(folder).as_posix()] = path.read_bytes()
+            except OSError as error:
+                raise InputError(f"{path}: cannot read: {error.strerror}") from error
+    return found
+
+
+def write_folder(files: Mapping[str, bytes], folder: Path) -> None:
+    """Make ``folder`` what `read_folder` saw; what stood there goes when the new content is complete.
+
+    Raises:
+        InputError: if a path leads out of the folder, or the place is not writable.
+    """
+    with output_errors(folder):
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        fresh = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=".new", dir=folder.parent))
+        try:
+            for name, content in files.items():
+                place = PurePosixPath(name)
+                # What a worker sends is written below this folder and nowhere else.
+                if place.is_absolute() or ".." in place.parts or not place.parts:
+                    raise InputError(f"{folder}: found {name!r} in what a worker sent, expected plain files")
+                (fresh / place).parent.mkdir(parents=True, exist_ok=True)
+                (fresh / place).write_bytes(content)
+            remove_folder(folder)
+            fresh.rename(folder)
+        except BaseException:
+            remove_folder(fresh)
+            raise

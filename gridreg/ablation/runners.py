@@ -3,27 +3,29 @@
 from __future__ import annotations
 
 import contextlib
-import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal, Protocol
 
 import torch
 
-from gridreg.ablation.claims import Claim, ClaimLostError, Heartbeat
-from gridreg.ablation.perform import LOG_NAME, Scenes, perform, reason_of
+from gridreg.ablation.claims import Claim, ClaimLostError, heartbeat
+from gridreg.ablation.database import DiskFullError
+from gridreg.ablation.perform import Scenes, TaskResult, is_disk_full, perform
 from gridreg.ablation.records import RunSpec, Study
 from gridreg.ablation.store import Store
 from gridreg.ablation.workers import Worker
 from gridreg.errors import InputError
-from gridreg.training.files import output_errors
+from gridreg.training.files import remove_folder
 
-__all__ = ["Event", "InProcess", "Report", "Runner", "finish_or_fail", "serve", "work_on"]
+__all__ = ["PAUSED", "Event", "InProcess", "Kind", "Report", "Runner", "serve", "settle"]
 
 Kind = Literal["started", "done", "failed", "interrupted", "lost"]
+
+PAUSED = "the study is paused, and the same command goes on from here when there is space"
+"""What is said of a full disk."""
+
 _POLL = 0.5
 
 
@@ -62,6 +64,7 @@ class Runner(Protocol):
 
         Raises:
             KeyboardInterrupt: after Ctrl-C or SIGTERM; what was under way is saved and waits.
+            DiskFullError: if there is no space for results; what was under way waits.
             InputError: if the runner itself cannot work; the store stays as it is.
         """
         ...
@@ -100,113 +103,67 @@ def serve(
 
     Raises:
         KeyboardInterrupt: if it was interrupted; the run under way is saved and waits.
+        DiskFullError: if there is no space for results; the run under way waits.
     """
     worker, scenes = Worker.current(), Scenes(store.folder / "scenes")
     while True:
         claim = store.claim(worker, study)
-        if claim is not None:
-            work_on(store, claim, scenes, report, keep_checkpoint=keep_checkpoints, log=log)
-        elif store.counts(study)["running"] == 0:
-            return
-        else:
+        if claim is None:
+            if store.counts(study)["running"] == 0:
+                return
             # Somebody else has the last runs; if that worker dies, they come here.
             time.sleep(_POLL)
+            continue
+        report(Event("started", claim.spec))
+        try:
+            with heartbeat(store.beat, [claim]):
+                result = perform(claim.spec, claim.folder, scenes, watch=claim.check, log=log)
+        except ClaimLostError:
+            report(Event("lost", claim.spec))
+            continue
+        except BaseException:
+            store.release(claim)
+            raise
+        settle(store, claim, result, report)
+        if result.metrics is not None and not keep_checkpoints:
+            remove_folder(claim.folder / "checkpoint")
+        if result.metrics is None and not result.reason:
+            raise KeyboardInterrupt
 
 
-def work_on(
-    store: Store,
-    claim: Claim,
-    scenes: Scenes,
-    report: Report,
-    *,
-    keep_checkpoint: bool = True,
-    log: bool = False,
-) -> None:
-    """Do a claimed run and tell the store how it ended.
+def settle(store: Store, claim: Claim, result: TaskResult, report: Report) -> None:
+    """Keep what came of a claimed run, and report it.
 
     Raises:
-        KeyboardInterrupt: if it was interrupted; it is saved and waits.
+        DiskFullError: if there is no space for it; the run waits.
     """
-    report(Event("started", claim.spec))
+    spec, reason = claim.spec, result.reason
     try:
-        with Heartbeat(store.beat) as heartbeat, _printing_to(claim.folder if log else None):
-            heartbeat.add(claim)
-            outcome = perform(
-                claim.spec, claim.folder, scenes, keep_checkpoint=keep_checkpoint, watch=claim.check
-            )
-    except ClaimLostError:
-        report(Event("lost", claim.spec))
-        return
-    except Exception as error:
-        finish_or_fail(store, claim, report, reason=_reason(error, claim))
-        return
-    except BaseException:
-        store.release(claim)
-        raise
-    if outcome.metrics is None:
-        store.release(claim)
-        report(Event("interrupted", claim.spec))
-        raise KeyboardInterrupt
-    finish_or_fail(
-        store,
-        claim,
-        report,
-        metrics=outcome.metrics,
-        machine=outcome.machine,
-        fingerprint=outcome.fingerprint,
-    )
-
-
-def finish_or_fail(
-    store: Store,
-    claim: Claim,
-    report: Report,
-    *,
-    reason: str = "",
-    metrics: dict[str, object] | None = None,
-    machine: str = "",
-    fingerprint: str = "",
-) -> None:
-    """Keep the metrics of a run, or the reason why there are none, and report it."""
-    spec = claim.spec
-    try:
-        if metrics is not None:
+        if result.disk_full:
+            raise DiskFullError(reason)
+        if result.metrics is not None:
             try:
-                store.finish(claim, metrics, machine=machine, fingerprint=fingerprint)
+                machine, fingerprint = result.machine, result.fingerprint
+                store.finish(claim, result.metrics, machine=machine, fingerprint=fingerprint)
             except InputError as error:
+                if is_disk_full(error):
+                    raise
                 reason = str(error)
             else:
-                report(_done(spec, metrics))
+                mean, seconds = result.metrics["mean"], result.metrics["seconds"]
+                report(Event("done", spec, psnr=float(mean["psnr"]), seconds=sum(seconds.values())))
                 return
-        store.fail(claim, reason)
-        report(Event("failed", spec, reason=reason))
+        if reason:
+            store.fail(claim, reason)
+        else:
+            store.release(claim)
+        report(Event("failed" if reason else "interrupted", spec, reason=reason))
     except ClaimLostError:
         report(Event("lost", spec))
-
-
-def _done(spec: RunSpec, metrics: dict[str, object]) -> Event:
-    mean, seconds = metrics["mean"], metrics["seconds"]
-    assert isinstance(mean, dict)
-    assert isinstance(seconds, dict)
-    return Event("done", spec, psnr=float(mean["psnr"]), seconds=sum(seconds.values()))
-
-
-def _reason(error: Exception, claim: Claim) -> str:
-    try:
-        return reason_of(error, claim.folder)
-    except InputError as unwritable:
-        return f"{type(error).__name__}: {error}; {unwritable}"
-
-
-@contextmanager
-def _printing_to(folder: Path | None) -> Iterator[None]:
-    """What is printed inside goes to the log of the run in ``folder``; to the terminal without one."""
-    if folder is None:
-        yield
-        return
-    with output_errors(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-        stream = (folder / LOG_NAME).open("a", encoding="utf-8")
-    with stream, contextlib.redirect_stderr(stream), contextlib.redirect_stdout(stream):
-        yield
-        sys.stderr.flush()
+    except InputError as error:
+        if not is_disk_full(error):
+            raise
+        # Where not even that can be written, the run waits when this process is gone.
+        with contextlib.suppress(InputError):
+            store.release(claim)
+        raise DiskFullError(f"{error}; {PAUSED}") from error

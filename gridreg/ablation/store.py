@@ -1,10 +1,10 @@
 """The store: a folder of runs and one SQLite database that says what is waiting, running, done and failed.
 
-    STORE/store.sqlite          who has what, metrics of finished runs, studies
-    STORE/runs/HASH/            what `gridreg.training.execute` leaves, and result.json when the run is finished
+    STORE/store.sqlite          who has what, results of finished runs, studies: the one truth about runs
+    STORE/runs/HASH/            what `gridreg.training.execute` leaves, and a copy of the result, ``result.json``
 
-Several processes write at the same time; each may be killed at any moment. A run belongs to one worker at a time.
-``result.json`` is complete or not there, and a run that has one is never repeated, whatever the database says.
+Several processes write at the same time; each may be killed at any moment. A run belongs to one worker at a time. A
+copy is read in one case only: where the database has never heard of the run, it is taken in as finished.
 """
 
 from __future__ import annotations
@@ -12,35 +12,30 @@ from __future__ import annotations
 import json
 import os
 import secrets
+import sqlite3
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from gridreg.ablation import transitions
 from gridreg.ablation.claims import Claim
 from gridreg.ablation.database import Database
 from gridreg.ablation.export import export_results
 from gridreg.ablation.records import STATUSES, RunResult, Status, Study
-from gridreg.ablation.transitions import (
-    RESULT_NAME,
-    adopt,
-    check_claim,
-    check_fingerprint,
-    count_loss,
-    members,
-    move_scene,
-    seen_status,
-    set_done,
-    set_failed,
-    set_waiting,
-)
+from gridreg.ablation.transitions import OF_STUDY, RESULT_NAME, name_of, set_status, status_of
 from gridreg.ablation.workers import Worker
 from gridreg.errors import InputError
 from gridreg.training.files import check_output_folder, write_json
 
-__all__ = ["Attempt", "Store"]
+__all__ = ["MOST_LOSSES", "RESULT_NAME", "Attempt", "Store"]
 
 Attempt = dict[str, Any]
+
+MOST_LOSSES = 3
+"""Times that a run may take its process down before it counts as failed."""
+
 _DATABASE = "store.sqlite"
 
 
@@ -73,11 +68,6 @@ class Store:
             )
         return Store(path, Database(path / _DATABASE, create=create, wait=wait))
 
-    @property
-    def note(self) -> str:
-        """What there is to know about the file system; empty on an ordinary one."""
-        return self._database.note
-
     def run_folder(self, spec_hash: str) -> Path:
         """The folder of a run."""
         return self.folder / "runs" / spec_hash
@@ -89,42 +79,46 @@ class Store:
             The number of runs that the store did not know.
         """
         new = 0
-        with self._database.writing() as connection:
+        with self._database.writing() as connection, self._database.decoding():
             connection.execute("DELETE FROM members WHERE study=?", (study.name,))
             connection.execute(
-                "INSERT OR REPLACE INTO studies VALUES (?, ?, ?, ?, ?)",
+                "INSERT OR REPLACE INTO studies (name, title, baseline, source, modules) VALUES (?, ?, ?, ?, ?)",
                 (study.name, study.title, study.baseline, study.source, json.dumps(study.modules)),
             )
             for position, spec in enumerate(study.runs):
-                values = (spec.hash, json.dumps(spec.to_json()), spec.scene_name)
                 inserted = connection.execute(
                     "INSERT OR IGNORE INTO runs (hash, spec, scene, status) VALUES (?, ?, ?, 'waiting')",
-                    values,
+                    (spec.hash, json.dumps(spec.to_json()), spec.scene_name),
                 ).rowcount
                 if inserted:
                     new += 1
-                    adopt(connection, spec.hash, self.run_folder(spec.hash))
+                    transitions.import_result(connection, spec, self.run_folder(spec.hash))
                 else:
-                    move_scene(connection, spec)
+                    transitions.move_scene(connection, spec)
                 connection.execute(
-                    "INSERT INTO members VALUES (?, ?, ?, ?)", (study.name, position, spec.hash, spec.label)
+                    "INSERT INTO members (study, position, hash, label) VALUES (?, ?, ?, ?)",
+                    (study.name, position, spec.hash, spec.label),
                 )
         return new
 
     def studies(self) -> list[Study]:
-        """Every study, by name."""
-        with self._database.reading() as connection:
-            rows = connection.execute("SELECT * FROM studies ORDER BY name").fetchall()
+        """Every study, by name.
+
+        Raises:
+            InputError: if what the database holds is damaged.
+        """
+        query = "SELECT name, title, baseline, source, modules FROM studies ORDER BY name"
+        with self._database.reading() as connection, self._database.decoding():
             return [
                 Study(
-                    row["name"],
-                    row["title"],
-                    row["baseline"],
-                    tuple(spec for spec, _ in members(connection, row["name"])),
-                    row["source"],
-                    tuple(json.loads(row["modules"])),
+                    name=str(row["name"]),
+                    title=str(row["title"]),
+                    baseline=str(row["baseline"]),
+                    runs=tuple(spec for spec, _ in transitions.members(connection, row["name"])),
+                    source=str(row["source"]),
+                    modules=transitions.names_of(row["modules"]),
                 )
-                for row in rows
+                for row in connection.execute(query).fetchall()
             ]
 
     def study(self, name: str) -> Study:
@@ -143,26 +137,30 @@ class Store:
         """What is known of the runs of a study, in its order; of all runs without one.
 
         A run whose worker has died counts as waiting.
+
+        Raises:
+            InputError: if what the database holds is damaged.
         """
-        name = study.name if isinstance(study, Study) else study
-        with self._database.reading() as connection:
+        with self._database.reading() as connection, self._database.decoding():
             return [
                 RunResult(
                     spec=spec,
-                    status=seen_status(row),
-                    metrics=None if row["metrics"] is None else json.loads(row["metrics"]),
-                    reason=row["reason"],
+                    status=status_of(row),
+                    metrics=transitions.metrics_of(row["metrics"]),
+                    reason=str(row["reason"]),
                     folder=self.run_folder(row["hash"]),
-                    seconds=row["seconds"],
-                    machine=row["machine"],
+                    seconds=float(row["seconds"]),
+                    machine=str(row["machine"]),
                 )
-                for spec, row in members(connection, name)
+                for spec, row in transitions.members(connection, name_of(study))
             ]
 
     def counts(self, study: Study | str | None = None) -> dict[Status, int]:
         """Number of runs by status, each run once."""
-        by_hash = {result.spec.hash: result.status for result in self.results(study)}
-        return {status: list(by_hash.values()).count(status) for status in STATUSES}
+        query = f"SELECT status, worker, heartbeat FROM runs WHERE {OF_STUDY}"
+        with self._database.reading() as connection, self._database.decoding():
+            found = [status_of(row) for row in connection.execute(query, {"study": name_of(study)})]
+        return {status: found.count(status) for status in STATUSES}
 
     def claim(self, worker: Worker, study: Study | str | None = None) -> Claim | None:
         """Take the next run that waits, or whose worker has died; None if there is none now.
@@ -171,35 +169,31 @@ class Store:
             worker: who will work on it.
             study: only runs of this study.
         """
-        name = study.name if isinstance(study, Study) else study
-        with self._database.writing() as connection:
-            for row in connection.execute("SELECT * FROM runs WHERE status='running'").fetchall():
-                if seen_status(row) == "waiting":
-                    set_waiting(connection, row["hash"], "lost")
-            for spec, row in members(connection, name):
-                if row["status"] != "waiting" or adopt(connection, row["hash"], self.run_folder(row["hash"])):
-                    continue
-                token, now = secrets.token_hex(8), time.time()
-                connection.execute(
-                    "UPDATE runs SET status='running', worker=?, token=?, heartbeat=?, reason='' WHERE hash=?",
-                    (worker.to_text(), token, now, row["hash"]),
-                )
-                connection.execute(
-                    "INSERT INTO attempts (hash, worker, began) VALUES (?, ?, ?)",
-                    (row["hash"], worker.to_text(), now),
-                )
-                return Claim(spec, self.run_folder(spec.hash), token)
-        return None
+        query = "SELECT hash, status, worker, heartbeat FROM runs WHERE status='running'"
+        with self._database.writing() as connection, self._database.decoding():
+            for row in connection.execute(query).fetchall():
+                if status_of(row) == "waiting":
+                    set_status(connection, row["hash"], "waiting", outcome="lost")
+            spec, row = next(transitions.members(connection, name_of(study), "waiting"), (None, None))
+            if spec is None or row is None:
+                return None
+            token, now = secrets.token_hex(8), time.time()
+            connection.execute(
+                "UPDATE runs SET status='running', worker=?, token=?, heartbeat=?, reason='' WHERE hash=?",
+                (worker.to_text(), token, now, row["hash"]),
+            )
+            connection.execute(
+                "INSERT INTO attempts (hash, worker, began) VALUES (?, ?, ?)",
+                (row["hash"], worker.to_text(), now),
+            )
+            return Claim(spec, self.run_folder(row["hash"]), token)
 
     def beat(self, claim: Claim) -> bool:
         """A sign of life; returns whether the claim still holds."""
+        query = "UPDATE runs SET heartbeat=? WHERE hash=? AND token=? AND status='running'"
         with self._database.writing() as connection:
-            return bool(
-                connection.execute(
-                    "UPDATE runs SET heartbeat=? WHERE hash=? AND token=? AND status='running'",
-                    (time.time(), claim.spec.hash, claim.token),
-                ).rowcount
-            )
+            values = (time.time(), claim.spec.hash, claim.token)
+            return bool(connection.execute(query, values).rowcount)
 
     def finish(
         self, claim: Claim, metrics: Mapping[str, Any], *, machine: str = "", fingerprint: str = ""
@@ -216,20 +210,18 @@ class Store:
             ClaimLostError: if somebody else has the run.
             InputError: if another run saw another scene under the same name and protocol.
         """
-        spec = claim.spec
         record = {
-            "spec": spec.to_json(),
-            "hash": spec.hash,
+            "spec": claim.spec.to_json(),
+            "hash": claim.spec.hash,
             "metrics": dict(metrics),
             "seconds": sum(metrics.get("seconds", {}).values()),
             "machine": machine,
             "fingerprint": fingerprint,
         }
-        with self._database.writing() as connection:
-            check_claim(connection, claim)
-            check_fingerprint(connection, spec, fingerprint)
+        with self._held(claim) as connection:
+            transitions.check_fingerprint(connection, claim.spec, fingerprint)
             write_json(claim.folder / RESULT_NAME, record)
-            set_done(connection, spec.hash, record)
+            transitions.set_done(connection, claim.spec.hash, record)
 
     def fail(self, claim: Claim, reason: str) -> None:
         """Keep the reason why a run failed; it is tried again on request only (`retry`).
@@ -237,53 +229,52 @@ class Store:
         Raises:
             ClaimLostError: if somebody else has the run.
         """
-        line = " ".join(reason.split()) or "no reason was given"
-        with self._database.writing() as connection:
-            check_claim(connection, claim)
-            set_failed(connection, claim.spec.hash, line)
+        with self._held(claim) as connection:
+            line = " ".join(reason.split()) or "no reason was given"
+            set_status(connection, claim.spec.hash, "failed", reason=line)
 
     def release(self, claim: Claim, outcome: str = "interrupted") -> None:
         """Give a run back unfinished; its checkpoint stays. Nothing happens if the claim is lost."""
         with self._database.writing() as connection:
-            held = connection.execute("SELECT token FROM runs WHERE hash=?", (claim.spec.hash,)).fetchone()
-            if held is not None and held["token"] == claim.token:
-                set_waiting(connection, claim.spec.hash, outcome)
+            if transitions.holds(connection, claim):
+                set_status(connection, claim.spec.hash, "waiting", outcome=outcome)
 
-    def lose(self, worker: Worker, reason: str) -> None:
+    def mark_lost(self, holder: Worker | Claim, reason: str) -> None:
         """Note that a worker has died: its runs wait again, or count as failed after `MOST_LOSSES` such deaths.
 
         Args:
-            worker: that died.
+            holder: the worker that died, or the claim under which it worked.
             reason: what is known of it, one line.
-        """
-        with self._database.writing() as connection:
-            query = "SELECT hash, losses FROM runs WHERE worker=? AND status='running'"
-            for row in connection.execute(query, (worker.to_text(),)).fetchall():
-                count_loss(connection, row["hash"], row["losses"] + 1, reason)
 
-    def lose_claim(self, claim: Claim, reason: str) -> None:
-        """Note that whoever worked under this claim has died, as `lose`."""
-        with self._database.writing() as connection:
-            check_claim(connection, claim)
-            query = "SELECT losses FROM runs WHERE hash=?"
-            losses = connection.execute(query, (claim.spec.hash,)).fetchone()["losses"] + 1
-            count_loss(connection, claim.spec.hash, losses, reason)
+        Raises:
+            ClaimLostError: if somebody else has the run of this claim.
+        """
+        column, value = (
+            ("worker", holder.to_text()) if isinstance(holder, Worker) else ("token", holder.token)
+        )
+        held = self._database.writing() if isinstance(holder, Worker) else self._held(holder)
+        with held as connection:
+            query = f"SELECT hash, losses FROM runs WHERE {column}=? AND status='running'"
+            for row in connection.execute(query, (value,)).fetchall():
+                losses = row["losses"] + 1
+                connection.execute("UPDATE runs SET losses=? WHERE hash=?", (losses, row["hash"]))
+                if losses < MOST_LOSSES:
+                    set_status(connection, row["hash"], "waiting", outcome="lost")
+                else:
+                    told = f"took its process down {losses} times (last: {reason})"
+                    set_status(connection, row["hash"], "failed", reason=told)
 
     def retry(self, study: Study | str | None = None) -> int:
         """Let failed runs wait again; returns how many."""
-        name = study.name if isinstance(study, Study) else study
+        update = f"UPDATE runs SET status='waiting', reason='', losses=0 WHERE status='failed' AND {OF_STUDY}"
         with self._database.writing() as connection:
-            failed = {row["hash"] for _, row in members(connection, name) if row["status"] == "failed"}
-            for spec_hash in failed:
-                connection.execute(
-                    "UPDATE runs SET status='waiting', reason='', losses=0 WHERE hash=?", (spec_hash,)
-                )
-        return len(failed)
+            return connection.execute(update, {"study": name_of(study)}).rowcount
 
     def attempts(self, since: int = 0) -> list[Attempt]:
         """Every attempt at a run after a number: ``number, hash, worker, began, ended, outcome``."""
+        columns = "number, hash, worker, began, ended, outcome"
+        query = f"SELECT {columns} FROM attempts WHERE number>? ORDER BY number"
         with self._database.reading() as connection:
-            query = "SELECT * FROM attempts WHERE number>? ORDER BY number"
             return [dict(row) for row in connection.execute(query, (since,))]
 
     def export(self, path: str | os.PathLike[str], study: Study | str | None = None) -> Path:
@@ -297,3 +288,12 @@ class Store:
             InputError: for another ending, an unwritable place, or Parquet without pyarrow.
         """
         return export_results(self.results(study), Path(path))
+
+    @contextmanager
+    def _held(self, claim: Claim) -> Iterator[sqlite3.Connection]:
+        """A transaction of whoever has the run; the word of somebody who has it no longer is refused."""
+        with self._database.writing() as connection:
+            if not transitions.holds(connection, claim):
+                claim.lost.set()
+                claim.check()
+            yield connection

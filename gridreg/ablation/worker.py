@@ -8,17 +8,20 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import signal
 import sys
 import threading
 from collections.abc import Sequence
 
-__all__ = ["main"]
+__all__ = ["EXIT_DISK_FULL", "main"]
+
+EXIT_DISK_FULL = 3
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Work; returns 0 when there is nothing left to do, 130 when told to stop, 2 for bad input."""
+    """Work; returns 0 when there is nothing left to do, 130 when told to stop, 2 for bad input, 3 for a full disk."""
     parser = argparse.ArgumentParser(description="Do the runs of a study that wait in a store.")
     parser.add_argument("--store", required=True, help="folder of the store")
     parser.add_argument("--study", required=True, help="name of the study in it")
@@ -32,6 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # After the thread has started: these take seconds, in which a parent may die.
     import torch
 
+    from gridreg.ablation.database import DiskFullError
     from gridreg.ablation.runners import serve
     from gridreg.ablation.store import Store
     from gridreg.ablation.study import import_modules
@@ -46,8 +50,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return 130
     except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+        # Where the disk is full, so is the log that this may go to.
+        with contextlib.suppress(OSError):
+            print(f"error: {error}", file=sys.stderr)
+        return EXIT_DISK_FULL if isinstance(error, DiskFullError) else 2
     return 0
 
 

@@ -8,6 +8,8 @@ import platform
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from gridreg.training.typed_data import from_data
+
 __all__ = ["Worker"]
 
 
@@ -50,10 +52,8 @@ class Worker:
             return _started(self.process) == self.started
         try:
             os.kill(self.process, 0)
-        except ProcessLookupError:
-            return False
-        except OSError:
-            return True
+        except OSError as error:
+            return not isinstance(error, ProcessLookupError)
         return True
 
     def to_text(self) -> str:
@@ -62,8 +62,12 @@ class Worker:
 
     @staticmethod
     def from_text(text: str) -> Worker:
-        """Undo `to_text`."""
-        return Worker(**json.loads(text))
+        """Undo `to_text`.
+
+        Raises:
+            ValueError: if it is no such text.
+        """
+        return from_data(Worker, json.loads(text), source="worker")
 
 
 def _place() -> str:
