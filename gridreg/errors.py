@@ -1,11 +1,12 @@
-"""The one exception for input that a user can mend, and the line that names what was meant."""
+"""Exceptions for input that a user can mend, and the line that names what was meant."""
 
 from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from typing import Any
 
-__all__ = ["RENAMED", "InputError", "near_names"]
+__all__ = ["RENAMED", "ConfigError", "InputError", "KeyPath", "near_names", "one_line"]
 
 RENAMED = {
     "Distortion": "DistortionLoss",
@@ -14,12 +15,60 @@ RENAMED = {
 }
 """Names that went, with those that took their place: found in files and programs from before."""
 
+KeyPath = tuple[str | int, ...]
+"""Keys and list indices from the top of plain data to a value in it, such as ``("train", "steps")``."""
+
+_LONGEST = 480
+
+
+def one_line(text: str, longest: int = _LONGEST) -> str:
+    """Text that may come from anybody's file, fit for a terminal or a log: one line, printable, not endless.
+
+    Line breaks, escapes and lone surrogates are written as in a Python string; of a long text the middle is left out.
+
+    Example:
+        >>> one_line("two\\nlines")
+        'two\\\\nlines'
+    """
+    shown = "".join(
+        c if c.isprintable() else c.encode("unicode_escape").decode() for c in text[: 4 * longest]
+    )
+    if len(text) <= longest and len(shown) <= longest:
+        return shown
+    tail = "".join(c if c.isprintable() else "?" for c in text[-longest // 4 :])
+    return f"{shown[: longest - len(tail) - 5]} ... {tail}"
+
 
 class InputError(ValueError):
     """Bad input: its text is one line that names the file or argument, what was found and what is expected.
 
-    The programs print that line and exit with status 2; library callers may catch it as a ``ValueError``.
+    The programs print that line and exit with status 2; library callers may catch it as a ``ValueError``. What cannot
+    be printed is escaped here, so that no name in a file becomes a line of its own or a command to the terminal.
     """
+
+    def __init__(self, text: object = "") -> None:
+        super().__init__(one_line(str(text)))
+
+
+class ConfigError(InputError):
+    """A value of a configuration that will not do.
+
+    Args:
+        path: where it stands; empty for the whole.
+        problem: what was found and what is expected, without path and source.
+        source: names the data, with the line where it is known, such as ``"study.yaml:12"``.
+
+    Example:
+        >>> ConfigError(("train", "steps"), "found 0, expected at least 1", "run.yaml:3")
+        ConfigError('run.yaml:3: train.steps: found 0, expected at least 1')
+    """
+
+    def __init__(self, path: KeyPath, problem: str, source: str = "") -> None:
+        self.path, self.problem, self.source = tuple(path), problem, source
+        super().__init__(": ".join(part for part in (source, ".".join(map(str, path)), problem) if part))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.path, self.problem, self.source)
 
 
 def near_names(name: object, valid: Iterable[str], count: int = 1) -> str:

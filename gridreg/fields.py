@@ -8,7 +8,7 @@ from typing import Any
 
 from torch import nn
 
-from gridreg.errors import InputError, near_names
+from gridreg.errors import ConfigError, InputError, near_names
 
 __all__ = ["field_names", "make_field", "register_field"]
 
@@ -46,9 +46,9 @@ def make_field(name: str, *arguments: Any, **options: Any) -> nn.Module:
         if not found:
             known = field_names()
             hint = near_names(name, known)
-            raise InputError(f"backbone: found {name!r}, expected one of {', '.join(known)}{hint}")
+            raise ConfigError(("backbone",), f"found {name!r}, expected one of {', '.join(known)}{hint}")
         constructor = found[0].load()
     try:
         return constructor(*arguments, **options)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, RuntimeError, ArithmeticError, MemoryError) as error:
         raise InputError(f"backbone {name!r}: {error}") from error

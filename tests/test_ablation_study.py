@@ -290,8 +290,8 @@ def test_two_scenes_of_one_name_are_refused(tmp_path):
         ("compositions: [none]\npresets: [quik]", r"study:2: presets: .*did you mean 'quick'"),
         ("compositions: [none]\nbackbones: [wm]", r"study:2: backbones: found the backbone 'wm', .*vm"),
         ("compositions: [{name: none, backbone: wm}]", r"study:1: compositions: found the backbone 'wm'"),
-        ("compositions: [{name: none, preset: quik}]", r"study:1: compositions: preset: found 'quik'"),
-        ("compositions: [none]\nset: {train.step: 3}", r"study:2: set: train.step: unknown key"),
+        ("compositions: [{name: none, preset: quik}]", r"study:1: compositions: found 'quik'"),
+        ("compositions: [none]\nset: {train.step: 3}", r"study:2: set.train.step: unknown key"),
         ("compositions: [none]\nset: {seed: 3}", "found 'seed'; expected the study's own key"),
         (
             "compositions: [none]\nbaseline: tensorf",
@@ -299,7 +299,7 @@ def test_two_scenes_of_one_name_are_refused(tmp_path):
         ),
         ("compositions: [none]\nsteps: 0", r"steps: found 0"),
         ("compositions: [none]\nsize: -1", r"size: found -1"),
-        ("compositions:\n  - none\n  - tensrf", r"study:3: compositions: unknown composition 'tensrf'"),
+        ("compositions:\n  - none\n  - tensrf", r"study:3: compositions.1: unknown composition 'tensrf'"),
         (
             "compositions: [none]\nmodules: [no_such_module_here]",
             "modules: cannot import 'no_such_module_here'",

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+import pickle
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,8 +13,8 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gridreg.errors import InputError
-from gridreg.training import config
+from gridreg.errors import ConfigError, InputError
+from gridreg.training import RunConfig, config
 from gridreg.training.strict_yaml import dump_yaml, parse_yaml, read_yaml
 
 
@@ -28,9 +29,9 @@ class Train:
 
     def __post_init__(self) -> None:
         if self.steps < 1:
-            raise InputError(f"train.steps: found {self.steps}, expected an integer of at least 1")
+            raise ConfigError(("steps",), f"found {self.steps}, expected an integer of at least 1")
         if any(e > self.steps for e in self.resample_at):
-            raise InputError(f"train.resample_at: found {max(self.resample_at)}, after the last step")
+            raise ConfigError(("resample_at",), f"found {max(self.resample_at)}, after the last step")
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,7 @@ def message(call: Any, *arguments: Any, **options: Any) -> str:
 finite = st.floats(allow_nan=False)
 words = st.text(max_size=12)
 plain = st.recursive(
-    st.none() | st.booleans() | st.integers(-(10**20), 10**20) | finite | words,
+    st.none() | st.booleans() | st.integers(1 - 2**63, 2**63 - 1) | finite | words,
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(words, inner, max_size=3),
     max_leaves=6,
 )
@@ -224,7 +225,7 @@ VALID = "valid: protocol, scene, out, until, box, options, weights, composition,
         ("scene: a\ntrain:\n  carve: true\n  steps: 0", "4: train.steps: found 0, expected an integer of"),
         ("train:\n  steps: 30", "1: train.resample_at: found 40, after the last step"),
         ("scene: a\nscene: b", "2: scene: stands twice, first in line 1"),
-        ("train: {steps: 1, steps: 2}", "1: steps: stands twice, first in line 1"),
+        ("train: {steps: 1, steps: 2}", "1: train.steps: stands twice, first in line 1"),
         ("1: 2", "1: key 1: expected text (quote it if it is meant so)"),
         ("? [a]\n: 2", "1: key a list or mapping: expected text"),
         ("scene: [a", "1: not valid YAML: while parsing a flow sequence expected ',' or ']'"),
@@ -305,7 +306,7 @@ def test_override_changes_nested_values_and_leaves_the_rest():
         ("nothing.at.all", "5", "command line: nothing: unknown key;"),
         ("train.steps", "many", "command line: train.steps: found 'many', expected an integer"),
         ("train.steps", "", "command line: train.steps: found '', expected an integer"),
-        ("train.steps", "[1", "command line: train.steps:1: not valid YAML"),
+        ("train.steps", "[1", "command line: train.steps: not valid YAML"),
         ("train.steps.more", "1", "command line: train.steps.more: there is nothing named 'more' inside 100"),
         ("composition.0", "1", "expected the number of an item below 0"),
         ("train", "5", "command line: train: found 5, expected a mapping"),
@@ -336,3 +337,42 @@ def test_what_is_not_plain_data_is_the_programmers_error():
         config.from_data(Unsupported, {"value": [1]})
     with pytest.raises(TypeError, match="not plain data"):
         config.to_data(Unsupported())
+
+
+def test_an_error_is_data_not_text(tmp_path):
+    """Whoever places an error in a file reads its path, and it survives the way between processes."""
+    with pytest.raises(ConfigError) as caught:
+        config.from_yaml(write(tmp_path, "scene: a\ntrain:\n  steps: 0"), Run)
+    error = pickle.loads(pickle.dumps(caught.value))
+    assert (error.path, error.source) == (("train", "steps"), f"{tmp_path / 'run.yaml'}:3")
+    assert str(error) == f"{error.source}: train.steps: {error.problem}"
+    document = parse_yaml("set: {train.steps: 0}\nrows: [1,\n  2]", "study")
+    assert document.where(("set", "train", "steps")) == "study:1"
+    message = r"^study:3: rows\.1\.steps: found 0, expected an integer"
+    with pytest.raises(ConfigError, match=message), document.locating("rows", 1):
+        Train(steps=0)
+
+
+@pytest.mark.parametrize("value", ["1" + "0" * 400, "0x" + "F" * 5000, "-99999999999999999999", ".nan"])
+@pytest.mark.parametrize(
+    "key", ["seed", "train.learning_rate_grid", "train.rays", "field.x", "composition.0.y"]
+)
+def test_numbers_that_nothing_can_hold(key, value):
+    base = replace(RunConfig(), composition=[{"name": "L1"}])
+    with pytest.raises(ConfigError, match=key) as caught:
+        config.override(base, {key: value})
+    assert len(str(caught.value)) < 200
+
+
+def test_a_long_number_in_place_of_text():
+    with pytest.raises(ConfigError, match="preset: found an integer of 20000 bits, expected text"):
+        config.from_data(RunConfig, parse_yaml("preset: 0x" + "F" * 5000))
+
+
+def test_messages_are_one_printable_line():
+    text = str(InputError(f"scene \x1b[2J\u2028\udcff: {'a/' * 6000}: expected one\nline"))
+    assert text.isprintable()
+    assert len(text) <= 500
+    assert text.startswith(r"scene \x1b[2J\u2028\udcff: a/a/")
+    assert text.endswith("a/: expected one?line")
+    assert str(InputError(text)) == text

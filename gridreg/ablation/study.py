@@ -26,13 +26,12 @@ import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from gridreg.ablation.fitting import check_fits
 from gridreg.ablation.records import RunSpec, Study
 from gridreg.ablation.rows import Row, expand_rows
 from gridreg.ablation.study_file import StudyFile
-from gridreg.errors import InputError
+from gridreg.errors import ConfigError, InputError
 from gridreg.fields import field_names
 from gridreg.scenes.protocols import Every, Listed, Protocol, get_protocol
 from gridreg.training.config import from_data, override, to_data
@@ -87,32 +86,20 @@ def study_from_text(
         [('none', 0), ('none', 1), ('tensorf', 0), ('tensorf', 1)]
     """
     document = parse_yaml(text, source)
-    file = from_data(
-        StudyFile, {} if document.data is None else document.data, source=source, lines=document.lines
-    )
+    file = from_data(StudyFile, document)
     import_modules(file.modules, source)
-
-    def where(*path: str | int) -> str:
-        line = next(
-            (document.lines[path[:n]] for n in range(len(path), 0, -1) if path[:n] in document.lines), None
-        )
-        return f"{source}:{line}" if line else source
 
     rows: list[Row] = []
     for index, entry in enumerate(file.compositions):
-        try:
+        with document.locating("compositions", index):
             rows += expand_rows(entry)
-        except InputError as error:
-            raise InputError(f"{where('compositions', index)}: compositions: {error}") from None
-    try:
+    with document.locating():
         scenes = [_scene_folder(scene, file, folder or Path()) for scene in file.scenes]
         _refuse_same_names(scenes)
         runs = tuple(_runs(file, rows, scenes))
-    except InputError as error:
-        key = str(error).partition(":")[0]
-        raise InputError(f"{where(key)}: {error}") from None
     labels = list(dict.fromkeys(run.label for run in runs))
-    baseline = _baseline(file, labels, where)
+    with document.locating():
+        baseline = _baseline(file, labels)
     study_name = file.name or re.sub(r"[^\w.-]+", "-", name)
     return Study(study_name, file.title or study_name, baseline, runs, text, tuple(file.modules))
 
@@ -120,8 +107,8 @@ def study_from_text(
 def _runs(file: StudyFile, rows: Sequence[Row], scenes: Sequence[Path | None]) -> list[RunSpec]:
     """Every run, row by row."""
     if len(rows) * len(scenes) * len(file.seeds) > _MOST_RUNS:
-        raise InputError(
-            f"compositions: found {len(rows)} rows, expected a study of at most {_MOST_RUNS} runs"
+        raise ConfigError(
+            ("compositions",), f"found {len(rows)} rows, expected a study of at most {_MOST_RUNS} runs"
         )
     runs: list[RunSpec] = []
     seen: dict[str, str] = {}
@@ -137,7 +124,9 @@ def _runs(file: StudyFile, rows: Sequence[Row], scenes: Sequence[Path | None]) -
                 config = _config(file, row, preset, backbone)
                 content = str(to_data(config))
                 if seen.setdefault(label, content) != content:
-                    raise InputError(f"compositions: two rows are called {label!r}; give one another label")
+                    raise ConfigError(
+                        ("compositions",), f"two rows are called {label!r}; give one another label"
+                    )
                 fit = str((config.backbone, config.field, config.composition))
                 if fit not in fitting:
                     fitting.add(fit)
@@ -175,37 +164,36 @@ def _check_fits(label: str, config: RunConfig) -> None:
     try:
         check_fits(config)
     except InputError as error:
-        raise InputError(f"compositions: row {label!r} with preset {config.preset}: {error}") from None
+        raise ConfigError(("compositions",), f"row {label!r} with preset {config.preset}: {error}") from None
 
 
 def _backbone_of(preset: str, key: str) -> str:
     try:
         return load_preset(preset).backbone
-    except InputError as error:
-        raise InputError(f"{key}: {error}") from None
+    except ConfigError as error:
+        raise ConfigError((key,), error.problem) from None
 
 
 def _config(file: StudyFile, row: Row, preset: str, backbone: str) -> RunConfig:
     """Preset, then field, composition, the study's values, the row's values, and the number of steps."""
     if backbone not in field_names():
         key = "compositions" if row.backbone else "backbones"
-        raise InputError(
-            f"{key}: found the backbone {backbone!r}, expected one of {', '.join(field_names())}"
+        raise ConfigError(
+            (key,), f"found the backbone {backbone!r}, expected one of {', '.join(field_names())}"
         )
     config = configure(TrainOptions(preset=preset, backbone=backbone))
     config = dataclasses.replace(config, composition=row.composition(config.composition))
     for key, changes in (("set", file.set), ("compositions", row.set)):
         for fixed in ("scene", "protocol", "seed", "preset", "backbone"):
             if fixed in changes:
-                raise InputError(
-                    f"{key}: found {fixed!r}; expected the study's own key for it, not a value to set"
+                raise ConfigError(
+                    (key,), f"found {fixed!r}; expected the study's own key for it, not a value to set"
                 )
         try:
-            config = override(
-                config, changes, source=f"set of {row.label!r}" if key == "compositions" else "set"
-            )
-        except InputError as error:
-            raise InputError(f"{key}: {str(error).removeprefix('set: ')}") from None
+            config = override(config, changes)
+        except ConfigError as error:
+            problem = error.problem if key == "set" else f"{error.problem} (row {row.label!r})"
+            raise ConfigError((key, *error.path), problem) from None
     steps = row.steps or file.steps
     return config if steps is None else dataclasses.replace(config, train=config.train.scaled(steps))
 
@@ -215,12 +203,13 @@ def _protocols(file: StudyFile, scene: Path | None) -> list[Protocol]:
         names = file.protocols or ["builtin8" if scene is None else "dietnerf8"]
         try:
             return [get_protocol(name) for name in names]
-        except InputError as error:
-            raise InputError(f"protocols: {str(error).removeprefix('protocol: ')}") from None
+        except ConfigError as error:
+            raise ConfigError(("protocols",), error.problem) from None
     if scene is None and max(file.views) > BUILTIN_FRAMES:
-        raise InputError(
-            f"views: found {max(file.views)}, but the built-in scene has {BUILTIN_FRAMES} training frames; "
-            "expected fewer, or scenes of your own"
+        raise ConfigError(
+            ("views",),
+            f"found {max(file.views)}, but the built-in scene has {BUILTIN_FRAMES} training frames; "
+            "expected fewer, or scenes of your own",
         )
     # The built-in scene's frames are in an order made for taking the first ones.
     return [get_protocol(f"{'first' if scene is None else 'views'}{count}") for count in file.views]
@@ -250,8 +239,8 @@ def _scene_folder(name: str, file: StudyFile, folder: Path) -> Path | None:
     near = sorted(path.name for path in beside.iterdir() if path.is_dir())[:20] if beside.is_dir() else []
     known = f" there are {', '.join(near)}" if near else ""
     looked = " or ".join(str(place) for place in places)
-    raise InputError(
-        f"scenes: found {name!r}, but there is no folder {looked}{hint};{known or ' expected a scene'}"
+    raise ConfigError(
+        ("scenes",), f"found {name!r}, but there is no folder {looked}{hint};{known or ' expected a scene'}"
     )
 
 
@@ -259,18 +248,18 @@ def _refuse_same_names(scenes: Sequence[Path | None]) -> None:
     names = [scene.name for scene in scenes if scene is not None]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice or "builtin" in names:
-        raise InputError(
-            f"scenes: two folders are called {(twice or ['builtin'])[0]!r}; rename one, results go by it"
+        raise ConfigError(
+            ("scenes",), f"two folders are called {(twice or ['builtin'])[0]!r}; rename one, results go by it"
         )
 
 
-def _baseline(file: StudyFile, labels: Sequence[str], where: Any) -> str:
+def _baseline(file: StudyFile, labels: Sequence[str]) -> str:
     if file.baseline is None:
         return labels[0]
     fitting = [label for label in labels if label == file.baseline or label.startswith(f"{file.baseline} [")]
     if not fitting:
-        raise InputError(
-            f"{where('baseline')}: baseline: found {file.baseline!r}, expected one of the rows {', '.join(labels)}"
+        raise ConfigError(
+            ("baseline",), f"found {file.baseline!r}, expected one of the rows {', '.join(labels)}"
         )
     return fitting[0]
 
@@ -284,5 +273,6 @@ def import_modules(modules: Sequence[str], source: str) -> None:
     for module in modules:
         try:
             importlib.import_module(module)
-        except ImportError as error:
-            raise InputError(f"{source}: modules: cannot import {module!r}: {error}") from error
+        # A module of somebody's may fail in any way, and so does the search for a strange name.
+        except Exception as error:
+            raise ConfigError(("modules",), f"cannot import {module!r}: {error}", source) from error

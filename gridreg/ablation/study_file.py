@@ -6,7 +6,7 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
-from gridreg.errors import InputError
+from gridreg.errors import ConfigError
 
 __all__ = ["StudyFile"]
 
@@ -55,14 +55,14 @@ class StudyFile:
         for key in ("compositions", "scenes", "seeds", "presets", "protocols", "views", "backbones"):
             values = getattr(self, key)
             if values == []:
-                raise InputError(f"{key}: found an empty list; a study without runs; expected at least one")
+                raise ConfigError((key,), "found an empty list; a study without runs; expected at least one")
             if values is not None and key != "compositions" and len(set(values)) < len(values):
-                raise InputError(f"{key}: found {values}, expected each value once")
+                raise ConfigError((key,), f"found {values}, expected each value once")
         if self.protocols is not None and self.views is not None:
-            raise InputError("views: found beside protocols; expected one of the two")
+            raise ConfigError(("views",), "found beside protocols; expected one of the two")
         for count in self.views or ():
             if count < 1:
-                raise InputError(f"views: found {count}, expected numbers of training views from 1")
+                raise ConfigError(("views",), f"found {count}, expected numbers of training views from 1")
         for name, value in (("steps", self.steps), ("size", self.size)):
             if value is not None and value < 1:
-                raise InputError(f"{name}: found {value}, expected an integer of at least 1")
+                raise ConfigError((name,), f"found {value}, expected an integer of at least 1")

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gridreg.errors import InputError
+from gridreg.errors import ConfigError
 
 __all__ = [
     "PROTOCOLS",
@@ -209,9 +209,9 @@ def get_protocol(name: str) -> Protocol:
     counted = re.fullmatch(r"(views|first|spread)([1-9]\d{0,5})", name)
     if counted is None:
         known = ", ".join(PROTOCOLS)
-        raise InputError(
-            f"protocol: found {name!r}, expected one of {known}, views<N>, first<N>, spread<N>, or one "
-            "of these with -validation"
+        raise ConfigError(
+            ("protocol",),
+            f"found {name!r}, expected one of {known}, views<N>, first<N>, spread<N>, or one of these with -validation",
         )
     count = int(counted[2])
     if counted[1] == "spread":

@@ -15,7 +15,7 @@ from typing import Any, Literal, TypeVar, get_origin
 
 from gridreg.errors import InputError
 from gridreg.training.files import write_text
-from gridreg.training.strict_yaml import dump_yaml, parse_yaml, read_yaml
+from gridreg.training.strict_yaml import Document, dump_yaml, parse_yaml, read_yaml
 from gridreg.training.typed_data import alternatives, field_types, from_data, to_data
 
 __all__ = ["assignments", "from_data", "from_yaml", "override", "save_yaml", "to_data", "to_yaml"]
@@ -33,11 +33,9 @@ def from_yaml(path: str | os.PathLike[str], cls: type[T], *, base: T | None = No
             are replaced as a whole.
 
     Raises:
-        InputError: one line that names file, line and key of what is wrong.
+        ConfigError: one line that names file, line and key of what is wrong.
     """
-    document = read_yaml(path)
-    data = {} if document.data is None else document.data
-    return from_data(cls, data, source=os.fspath(path), lines=document.lines, base=base)
+    return from_data(cls, read_yaml(path), base=base)
 
 
 def to_yaml(config: Any) -> str:
@@ -67,11 +65,13 @@ def override(config: T, changes: Mapping[str, Any], *, source: str = "command li
     ``"0525"`` as it is. All changes take effect together, so values that must agree can change together.
 
     Raises:
-        InputError: names ``source`` and the key that is unknown or has a value of the wrong type.
+        ConfigError: names ``source`` and the key that is unknown or has a value of the wrong type.
     """
     data = to_data(config)
     for dotted, value in changes.items():
-        _change(data, type(config), dotted.split("."), value, f"{source}: {dotted}")
+        keys = dotted.split(".")
+        with Document(data, source).locating(*keys):
+            _change(data, type(config), keys, value)
     return from_data(type(config), data, source=source)
 
 
@@ -96,7 +96,7 @@ def assignments(texts: Sequence[str]) -> dict[str, str]:
     return changes
 
 
-def _change(data: Any, hint: Any, keys: list[str], value: Any, where: str) -> None:
+def _change(data: Any, hint: Any, keys: list[str], value: Any) -> None:
     """Set the value at ``keys`` inside plain ``data``, whose declared type is ``hint``."""
     key, rest = keys[0], keys[1:]
     place: Any
@@ -105,15 +105,15 @@ def _change(data: Any, hint: Any, keys: list[str], value: Any, where: str) -> No
     elif isinstance(data, list) and key.isdecimal() and int(key) < len(data):
         place, inner = int(key), _inner_type(hint, None)
     elif isinstance(data, list):
-        raise InputError(f"{where}: found {key!r}, expected the number of an item below {len(data)}")
+        raise InputError(f"found {key!r}, expected the number of an item below {len(data)}")
     else:
-        raise InputError(f"{where}: there is nothing named {key!r} inside {data!r}")
+        raise InputError(f"there is nothing named {key!r} inside {data!r}")
     if not rest:
-        data[place] = _value(value, inner, where)
+        data[place] = _value(value, inner)
         return
     if isinstance(data, dict) and data.get(key) is None:
         data[key] = {}
-    _change(data[place], inner, rest, value, where)
+    _change(data[place], inner, rest, value)
 
 
 def _inner_type(hint: Any, key: str | None) -> Any:
@@ -127,11 +127,11 @@ def _inner_type(hint: Any, key: str | None) -> Any:
     return Any
 
 
-def _value(value: Any, hint: Any, where: str) -> Any:
+def _value(value: Any, hint: Any) -> Any:
     if not isinstance(value, str):
         return to_data(value)
     members = alternatives(hint)
     if any(m in (str, Path) or get_origin(m) is Literal for m in members):
         # "null" on the command line means null wherever null is allowed.
         return None if value in ("null", "~") and type(None) in members else value
-    return parse_yaml(value, where).data if value.strip() else value
+    return parse_yaml(value).data if value.strip() else value

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gridreg.errors import InputError, near_names
+from gridreg.errors import ConfigError, near_names
 from gridreg.training.config import from_yaml
 from gridreg.training.settings import RunConfig
 
@@ -26,12 +26,12 @@ def load_preset(name: str) -> RunConfig:
     """The configuration of a preset.
 
     Raises:
-        InputError: if there is none of this name, with the names there are.
+        ConfigError: if there is none of this name, with the names there are.
     """
     names = preset_names()
     if name not in names:
-        raise InputError(
-            f"preset: found {name!r}, expected one of {', '.join(names)}{near_names(name, names)}"
+        raise ConfigError(
+            ("preset",), f"found {name!r}, expected one of {', '.join(names)}{near_names(name, names)}"
         )
     config = from_yaml(_folder() / f"{name}.yaml", RunConfig)
     return RunConfig(**{**config.__dict__, "preset": name})

@@ -7,9 +7,22 @@ import math
 from dataclasses import dataclass, replace
 from typing import Any
 
-from gridreg.errors import InputError
+from gridreg.errors import ConfigError
 
 __all__ = ["RunConfig", "TrainSettings"]
+
+_AT_LEAST = {
+    "steps": 1,
+    "rays": 1,
+    "patches": 1,
+    "patch_size": 2,
+    "voxels_start": 1,
+    "voxels_end": 1,
+    "occupancy_resolution": 1,
+    "occupancy_every": 0,
+}
+# Of every integer above: more is a slip of the hand, and would end as an overflow somewhere.
+_MOST = 10**9
 
 
 @dataclass(frozen=True)
@@ -77,23 +90,27 @@ class TrainSettings:
     evaluate_at: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
-        for name in ("steps", "rays", "patches", "voxels_start", "voxels_end", "occupancy_resolution"):
+        for name, least in _AT_LEAST.items():
             value = getattr(self, name)
-            if value < 1:
-                raise InputError(f"train.{name}: found {value}, expected an integer of at least 1")
-        if self.patch_size < 2:
-            raise InputError(f"train.patch_size: found {self.patch_size}, expected an integer of at least 2")
+            if not least <= value <= _MOST:
+                bound = f"at least {least}" if value < least else f"at most {_MOST:,}"
+                raise ConfigError((name,), f"found {value}, expected an integer of {bound}")
         for name in ("learning_rate_grid", "learning_rate_network", "learning_rate_decay", "step_ratio"):
             value = getattr(self, name)
             if not (value > 0 and math.isfinite(value)):
-                raise InputError(f"train.{name}: found {value}, expected a positive number")
+                raise ConfigError((name,), f"found {value}, expected a positive number")
+        for name in ("occupancy_threshold", "weight_bound", "transmittance_bound"):
+            value = getattr(self, name)
+            if not 0 <= value < 1:
+                raise ConfigError((name,), f"found {value}, expected a number in [0, 1)")
         if not 0 <= self.average_from <= 1:
-            raise InputError(f"train.average_from: found {self.average_from}, expected a share in [0, 1]")
+            raise ConfigError(("average_from",), f"found {self.average_from}, expected a fraction in [0, 1]")
         stray = [s for s in self.shrink_at if s not in self.occupancy_at]
         if stray:
-            raise InputError(
-                f"train.shrink_at: found {stray[0]}, which is not in occupancy_at {self.occupancy_at}; "
-                "the box can only shrink where the occupancy is known"
+            raise ConfigError(
+                ("shrink_at",),
+                f"found {stray[0]}, which is not in occupancy_at {self.occupancy_at}; "
+                "the box can only shrink where the occupancy is known",
             )
 
     def scaled(self, steps: int) -> TrainSettings:

@@ -10,16 +10,17 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NoReturn
 
 import yaml
 
-from gridreg.errors import InputError
+from gridreg.errors import ConfigError, InputError, KeyPath
 
-__all__ = ["Document", "KeyPath", "dump_yaml", "parse_yaml", "read_yaml"]
-
-KeyPath = tuple[str | int, ...]
+__all__ = ["Document", "dump_yaml", "parse_yaml", "read_yaml"]
 
 _RESOLVERS = [
     ("bool", r"true|True|TRUE|false|False|FALSE", "tTfF"),
@@ -30,11 +31,48 @@ _RESOLVERS = [
 ]
 
 
-class Document(NamedTuple):
-    """Plain data and the line (from 1) at which each key or list item stands."""
+@dataclass(frozen=True)
+class Document:
+    """Plain data, and where in its source each piece stands.
+
+    Args:
+        data: dicts, lists, text, numbers, ``None``.
+        source: names the data in errors.
+        lines: the line (from 1) of each key or list item, where the source has lines.
+    """
 
     data: Any
-    lines: dict[KeyPath, int]
+    source: str = "config"
+    lines: dict[KeyPath, int] = field(default_factory=dict)
+
+    def where(self, path: KeyPath) -> str:
+        """``source:line`` of what stands at ``path``, or of the nearest key above it.
+
+        A key may itself be dotted: ``("set", "train", "rays")`` finds ``set: {train.rays: 512}``.
+        """
+        for length in range(len(path), -1, -1):
+            dotted = (*path[:length], ".".join(map(str, path[length:])))
+            for known in (dotted, path[:length]):
+                if known in self.lines:
+                    return f"{self.source}:{self.lines[known]}"
+        return self.source
+
+    def error(self, path: KeyPath, problem: str) -> ConfigError:
+        """An error that names source, line and key."""
+        return ConfigError(path, problem, self.where(path))
+
+    @contextmanager
+    def locating(self, *path: str | int) -> Iterator[None]:
+        """Give an `InputError`, or another ``ValueError``, raised inside the place of ``path``.
+
+        What a `ConfigError` says of keys below that place is kept.
+        """
+        try:
+            yield
+        except ConfigError as error:
+            raise self.error((*path, *error.path), error.problem) from error
+        except ValueError as error:
+            raise self.error(path, str(error)) from error
 
 
 def read_yaml(path: str | os.PathLike[str]) -> Document:
@@ -71,24 +109,24 @@ def parse_yaml(text: str, source: str = "YAML") -> Document:
         loader = _Loader(text)
         node = loader.get_single_node()
         if node is None:
-            return Document(None, {})
+            return Document(None, source)
         lines: dict[KeyPath, int] = {}
         _collect_lines(node, (), lines, source)
-        return Document(loader.construct_document(node), lines)
+        return Document(loader.construct_document(node), source, lines)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         where = f"{source}:{mark.line + 1}" if mark else source
         problem = " ".join(part for part in (error.context, error.problem) if part)
-        raise InputError(f"{where}: not valid YAML: {_flat(problem)}") from error
+        raise ConfigError((), f"not valid YAML: {_flat(problem)}", where) from error
     except yaml.YAMLError as error:
-        raise InputError(f"{source}: not valid YAML: {_flat(str(error))}") from error
-    except InputError:
+        raise ConfigError((), f"not valid YAML: {_flat(str(error))}", source) from error
+    except ConfigError:
         raise
     except ValueError as error:
         # Python refuses integers of more than some thousand digits.
-        raise InputError(f"{source}: not valid YAML: {_flat(str(error))}") from error
+        raise ConfigError((), f"not valid YAML: {_flat(str(error))}", source) from error
     except RecursionError:
-        raise InputError(f"{source}: nested too deeply to be a configuration") from None
+        raise ConfigError((), "nested too deeply to be a configuration", source) from None
     finally:
         if loader is not None:
             loader.dispose()
@@ -169,10 +207,12 @@ def _collect_lines(node: yaml.Node, path: KeyPath, lines: dict[KeyPath, int], so
             line = key.start_mark.line + 1
             if key.tag != "tag:yaml.org,2002:str":
                 found = _flat(str(key.value)) if isinstance(key, yaml.ScalarNode) else "a list or mapping"
-                raise InputError(f"{source}:{line}: key {found}: expected text (quote it if it is meant so)")
+                problem = f"key {found}: expected text (quote it if it is meant so)"
+                raise ConfigError(path, problem, f"{source}:{line}")
             inner = (*path, key.value)
             if inner in lines:
-                raise InputError(f"{source}:{line}: {key.value}: stands twice, first in line {lines[inner]}")
+                problem = f"stands twice, first in line {lines[inner]}"
+                raise ConfigError((*path, key.value), problem, f"{source}:{line}")
             lines[inner] = line
             _collect_lines(value, inner, lines, source)
 

@@ -15,13 +15,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union
 
-from gridreg.errors import InputError
+from gridreg.errors import KeyPath
+from gridreg.training.strict_yaml import Document
 
 __all__ = ["alternatives", "field_types", "from_data", "to_data"]
 
 T = TypeVar("T")
-KeyPath = tuple[str | int, ...]
 
+# Of integers: what NumPy, torch and SQLite can hold.
+_LARGEST = 2**63 - 1
 _SCALARS = {int: "an integer", float: "a number", bool: "true or false", str: "text", Path: "a path"}
 
 
@@ -30,7 +32,6 @@ def from_data(
     data: Any,
     *,
     source: str = "config",
-    lines: Mapping[KeyPath, int] | None = None,
     base: T | None = None,
 ) -> T:
     """Build an instance of the dataclass ``cls`` from plain data.
@@ -40,15 +41,15 @@ def from_data(
 
     Args:
         cls: the dataclass.
-        data: a mapping of its keys to plain data; what it leaves out has the default, or the value in
-            ``base``.
-        source: names the data in errors.
-        lines: the line of each key path, if the data come from a file.
+        data: a mapping of its keys to plain data, or a `Document` of one, whose lines errors then name; what it leaves
+            out has the default, or the value in ``base``.
+        source: names data that are no `Document` in errors.
         base: what holds where the data are silent, instead of the defaults. Nested dataclasses are merged
             key by key; lists and dicts are replaced as a whole.
 
     Raises:
-        InputError: one line that names source, line and key of what is wrong.
+        ConfigError: names source, line and key of what is wrong. A check of the dataclass itself raises it with a path
+            inside the dataclass.
         TypeError: if ``cls`` declares a field of a type not listed above.
 
     Example:
@@ -59,9 +60,12 @@ def from_data(
         Settings(steps=5)
         >>> from_data(Settings, {"step": 5})
         Traceback (most recent call last):
-        gridreg.errors.InputError: config: step: unknown key, did you mean steps? valid: steps
+        gridreg.errors.ConfigError: config: step: unknown key, did you mean steps? valid: steps
     """
-    return _Reader(source, lines or {}).build(cls, data, (), base)
+    if isinstance(data, Document):
+        # An empty file says nothing, and all of it has defaults.
+        return _Reader(data).build(cls, {} if data.data is None else data.data, (), base)
+    return _Reader(Document(data, source)).build(cls, data, (), base)
 
 
 def to_data(value: Any) -> Any:
@@ -101,20 +105,9 @@ def alternatives(hint: Any) -> tuple[Any, ...]:
 class _Reader:
     """Builds dataclasses from plain data and knows where each piece of it stands."""
 
-    def __init__(self, source: str, lines: Mapping[KeyPath, int]) -> None:
-        self.source = source
-        self.lines = lines
-
-    def where(self, path: KeyPath) -> str:
-        """``source:line`` of what stands at ``path``, or of the nearest key above it."""
-        for length in range(len(path), -1, -1):
-            if path[:length] in self.lines:
-                return f"{self.source}:{self.lines[path[:length]]}"
-        return self.source
-
-    def error(self, path: KeyPath, message: str) -> InputError:
-        dotted = ".".join(map(str, path))
-        return InputError(": ".join(part for part in (self.where(path), dotted, message) if part))
+    def __init__(self, document: Document) -> None:
+        self.error = document.error
+        self.locating = document.locating
 
     def build(self, cls: type[T], data: Any, path: KeyPath, base: T | None) -> T:
         if not isinstance(data, Mapping):
@@ -137,19 +130,18 @@ class _Reader:
                 and field.default_factory is dataclasses.MISSING
             ):
                 raise self.error((*path, name), f"missing, expected {_expected(hints[name])}")
-        try:
+        with self.locating(*path):
             return cls(**values)
-        except ValueError as error:
-            # A check of the dataclass itself; where its text begins with a key, that key has a line.
-            keys = tuple(str(error).partition(":")[0].split("."))
-            at = next((p for p in (keys, (*path, *keys)) if p in self.lines), path)
-            raise InputError(f"{self.where(at)}: {error}") from error
 
     def convert(self, value: Any, hint: Any, path: KeyPath, base: Any = None) -> Any:
         """The value as the declared type ``hint``, or an error that names ``path``."""
         members = alternatives(hint)
         for member in members:
-            if member is Any or (member in (int, bool, str, type(None)) and type(value) is member):
+            if member is int and type(value) is int and abs(value) > _LARGEST:
+                raise self.error(path, f"found {_shown(value)}, expected an integer of at most 64 bits")
+            if member is Any:
+                return self.plain(value, path)
+            if member in (int, bool, str, type(None)) and type(value) is member:
                 return value
             if member is float and type(value) is float and not math.isnan(value):
                 return value
@@ -157,7 +149,7 @@ class _Reader:
                 return value
         for member in members:
             origin, arguments = typing.get_origin(member), typing.get_args(member)
-            if member is float and type(value) is int:
+            if member is float and type(value) is int and abs(value) <= _LARGEST:
                 return float(value)
             if member is Path and type(value) is str:
                 return Path(value)
@@ -173,6 +165,17 @@ class _Reader:
             if (origin or member) is tuple and isinstance(value, (list, tuple)):
                 return self.convert_tuple(value, arguments, path)
         raise self.error(path, f"found {_shown(value)}, expected {_expected(hint)}")
+
+    def plain(self, value: Any, path: KeyPath) -> Any:
+        """Any plain value, without NaN, which passes every check of a range, and integers that nothing can hold."""
+        if isinstance(value, float) and math.isnan(value):
+            raise self.error(path, "found nan, expected a number")
+        if isinstance(value, int) and abs(value) > _LARGEST:
+            raise self.error(path, f"found {_shown(value)}, expected at most 64 bits")
+        items = value.items() if isinstance(value, Mapping) else ()
+        for key, inner in enumerate(value) if isinstance(value, (list, tuple)) else items:
+            self.plain(inner, (*path, key))
+        return value
 
     def convert_tuple(self, value: Any, arguments: tuple[Any, ...], path: KeyPath) -> tuple[Any, ...]:
         if len(arguments) == 2 and arguments[1] is Ellipsis:
@@ -218,6 +221,9 @@ def _shown(value: Any) -> str:
     if isinstance(value, (list, tuple)):
         return f"a list of {len(value)}"
     words = {None: "null", True: "true", False: "false"}
+    if isinstance(value, int) and abs(value) > _LARGEST:
+        # Python refuses to write out very long ones.
+        return f"an integer of {value.bit_length()} bits"
     text = words[value] if value is None or isinstance(value, bool) else repr(value)
     return text if len(text) <= 60 else text[:57] + "..."
 
