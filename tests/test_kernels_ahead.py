@@ -43,13 +43,13 @@ def test_it_compiles_until_it_meets_the_other_process(tmp_path):
         """
         from gridreg.ops.cpu.jit import precompile as ahead
         from gridreg.ops.cpu import reductions as sums
-        sums._thin.address
-        ahead._ORDER = ("cpu.reductions._measure", "cpu.composite._seen", "cpu.reductions._thin")
+        sums._round.address
+        ahead._ORDER = ("cpu.reductions._measure", "cpu.composite._seen", "cpu.reductions._round")
         ahead.main()
         """,
         GRIDREG_COMPILE_AHEAD="0",
     )
-    assert compiled == ["composite._seen", "reductions._measure", "reductions._thin"]
+    assert compiled == ["composite._seen", "reductions._measure", "reductions._round"]
 
 
 @pytest.mark.skipif(

@@ -13,7 +13,7 @@ from backbones.vm import LINE_AXES, PLANE_AXES
 from gridreg.attach._hooks import open_channels
 from gridreg.errors import InputError
 from gridreg.ops.cpu import lookups
-from gridreg.ops.cpu.reductions import thin
+from gridreg.ops.cpu.reductions import round_stochastically
 from gridreg.ops.linear import product_dtype
 
 from . import common, machine, step
@@ -82,11 +82,11 @@ def felt_by(situation: Situation, turn: int) -> Tensor:
     found: list[Tensor] = []
 
     def watched(values: Tensor, share: float) -> Tensor:
-        rounded = thin(values, share)
+        rounded = round_stochastically(values, share)
         found.append(rounded != 0)
         return rounded
 
-    with replaced(lookups, "thin", watched):
+    with replaced(lookups, "round_stochastically", watched):
         situation.run(turn)
     return found[0]
 

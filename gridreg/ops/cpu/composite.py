@@ -11,15 +11,12 @@ from torch.autograd.function import once_differentiable
 
 from gridreg.ops import composite as ops
 from gridreg.ops.cpu.jit.compiler import (
+    Matrix,
+    Vector,
     float32,
     int64,
-    integer,
     kernel,
-    matrix,
-    next_task,
-    real,
     uint8,
-    vector,
 )
 from gridreg.ops.cpu.jit.launch import launch
 
@@ -34,40 +31,34 @@ def _tasks(offsets: Tensor) -> int:
 
 
 @kernel
-def _weights_forward(table: Any) -> None:
+def _weights_forward(
+    task: int, offsets: Vector[int64], alpha: Vector[float32], through: Vector[float32],
+    weights: Vector[float32], after: Vector[float32],
+) -> None:  # fmt: skip
     """``w_n = T_n alpha_n`` and ``T_{n+1}``, from ``alpha`` and ``exp(-tau)``."""
-    offsets, alpha, through = vector(table, 0, int64), vector(table, 1, float32), vector(table, 2, float32)
-    weights, after = vector(table, 3, float32), vector(table, 4, float32)
     rays, samples = offsets.shape[0] - 1, alpha.shape[0]
-    while True:
-        task = next_task(table)
-        if task < 0:
-            break
-        for ray in range(task * _RAYS, min((task + 1) * _RAYS, rays)):
-            transmittance = float32(1)
-            for n in range(max(offsets[ray], 0), min(offsets[ray + 1], samples)):
-                weights[n] = transmittance * alpha[n]
-                transmittance *= through[n]
-                after[n] = transmittance
+    for ray in range(task * _RAYS, min((task + 1) * _RAYS, rays)):
+        transmittance = float32(1)
+        for n in range(max(offsets[ray], 0), min(offsets[ray + 1], samples)):
+            weights[n] = transmittance * alpha[n]
+            transmittance *= through[n]
+            after[n] = transmittance
 
 
 @kernel
-def _weights_backward(table: Any) -> None:
+def _weights_backward(
+    task: int, offsets: Vector[int64], weights: Vector[float32], after: Vector[float32],
+    gradient: Vector[float32], result: Vector[float32],
+) -> None:  # fmt: skip
     """``dL/dtau_n = g_n T_{n+1} - sum_{m > n} g_m w_m``."""
-    offsets, weights, after = vector(table, 0, int64), vector(table, 1, float32), vector(table, 2, float32)
-    gradient, result = vector(table, 3, float32), vector(table, 4, float32)
     rays, samples = offsets.shape[0] - 1, weights.shape[0]
-    while True:
-        task = next_task(table)
-        if task < 0:
-            break
-        for ray in range(task * _RAYS, min((task + 1) * _RAYS, rays)):
-            behind = 0.0
-            first, end = max(offsets[ray], 0), min(offsets[ray + 1], samples)
-            for back in range(end - first):
-                n = end - 1 - back
-                result[n] = float32(gradient[n] * after[n] - behind)
-                behind += gradient[n] * weights[n]
+    for ray in range(task * _RAYS, min((task + 1) * _RAYS, rays)):
+        behind = 0.0
+        first, end = max(offsets[ray], 0), min(offsets[ray + 1], samples)
+        for back in range(end - first):
+            n = end - 1 - back
+            result[n] = float32(gradient[n] * after[n] - behind)
+            behind += gradient[n] * weights[n]
 
 
 class _Weights(Function):
@@ -90,46 +81,39 @@ class _Weights(Function):
 
 
 @kernel
-def _sums_forward(table: Any) -> None:
+def _sums_forward(
+    task: int, offsets: Vector[int64], weights: Vector[float32], values: Matrix[float32],
+    sums: Matrix[float32],
+) -> None:  # fmt: skip
     """``sum_n w_n v_n`` of every ray."""
-    offsets, weights = vector(table, 0, int64), vector(table, 1, float32)
-    values, sums = matrix(table, 2, float32), matrix(table, 3, float32)
     rays, samples, channels = offsets.shape[0] - 1, weights.shape[0], values.shape[1]
-    while True:
-        task = next_task(table)
-        if task < 0:
-            break
-        for ray in range(task * _RAYS, min((task + 1) * _RAYS, rays)):
-            total = sums[ray]
+    for ray in range(task * _RAYS, min((task + 1) * _RAYS, rays)):
+        total = sums[ray]
+        for k in range(channels):
+            total[k] = float32(0)
+        for n in range(max(offsets[ray], 0), min(offsets[ray + 1], samples)):
             for k in range(channels):
-                total[k] = float32(0)
-            for n in range(max(offsets[ray], 0), min(offsets[ray + 1], samples)):
-                for k in range(channels):
-                    total[k] += weights[n] * values[n, k]
+                total[k] += weights[n] * values[n, k]
 
 
 @kernel
-def _sums_backward(table: Any) -> None:
+def _sums_backward(
+    task: int, offsets: Vector[int64], weights: Vector[float32], values: Matrix[float32],
+    gradient: Matrix[float32], of_weights: Vector[float32], of_values: Matrix[float32], want_weights: int64,
+    want_values: int64,
+) -> None:  # fmt: skip
     """Gradients with respect to the weights and, where wanted, the values."""
-    offsets, weights = vector(table, 0, int64), vector(table, 1, float32)
-    values, gradient = matrix(table, 2, float32), matrix(table, 3, float32)
-    of_weights, of_values = vector(table, 4, float32), matrix(table, 5, float32)
-    want_weights, want_values = integer(table, 6), integer(table, 7)
     rays, samples, channels = offsets.shape[0] - 1, weights.shape[0], values.shape[1]
-    while True:
-        task = next_task(table)
-        if task < 0:
-            break
-        for ray in range(task * _RAYS, min((task + 1) * _RAYS, rays)):
-            for n in range(max(offsets[ray], 0), min(offsets[ray + 1], samples)):
-                if want_weights:
-                    total = float32(0)
-                    for k in range(channels):
-                        total += gradient[ray, k] * values[n, k]
-                    of_weights[n] = total
-                if want_values:
-                    for k in range(channels):
-                        of_values[n, k] = weights[n] * gradient[ray, k]
+    for ray in range(task * _RAYS, min((task + 1) * _RAYS, rays)):
+        for n in range(max(offsets[ray], 0), min(offsets[ray + 1], samples)):
+            if want_weights:
+                total = float32(0)
+                for k in range(channels):
+                    total += gradient[ray, k] * values[n, k]
+                of_weights[n] = total
+            if want_values:
+                for k in range(channels):
+                    of_values[n, k] = weights[n] * gradient[ray, k]
 
 
 class _Sums(Function):
@@ -164,56 +148,48 @@ class _Sums(Function):
 
 
 @kernel
-def _pixels_forward(table: Any) -> None:
+def _pixels_forward(
+    task: int, offsets: Vector[int64], weights: Vector[float32], colours: Matrix[float32], t: Vector[float32],
+    background: Matrix[float32], out: Matrix[float32], opacity: Vector[float32], depth: Vector[float32],
+) -> None:  # fmt: skip
     """Offsets, weights, colours, distances, background; colour, opacity and depth of every ray."""
-    offsets, weights = vector(table, 0, int64), vector(table, 1, float32)
-    colours, t, background = matrix(table, 2, float32), vector(table, 3, float32), matrix(table, 4, float32)
-    out, opacity, depth = matrix(table, 5, float32), vector(table, 6, float32), vector(table, 7, float32)
     rays, samples = offsets.shape[0] - 1, weights.shape[0]
-    while True:
-        task = next_task(table)
-        if task < 0:
-            break
-        for ray in range(task * _RAYS, min((task + 1) * _RAYS, rays)):
-            red, green, blue = float32(0), float32(0), float32(0)
-            sum_, far = float32(0), float32(0)
-            for n in range(max(offsets[ray], 0), min(offsets[ray + 1], samples)):
-                weight = weights[n]
-                red += weight * colours[n, 0]
-                green += weight * colours[n, 1]
-                blue += weight * colours[n, 2]
-                sum_ += weight
-                far += weight * t[n]
-            rest = float32(1) - sum_
-            out[ray, 0] = red + rest * background[ray, 0]
-            out[ray, 1] = green + rest * background[ray, 1]
-            out[ray, 2] = blue + rest * background[ray, 2]
-            opacity[ray], depth[ray] = sum_, far
+    for ray in range(task * _RAYS, min((task + 1) * _RAYS, rays)):
+        red, green, blue = float32(0), float32(0), float32(0)
+        sum_, far = float32(0), float32(0)
+        for n in range(max(offsets[ray], 0), min(offsets[ray + 1], samples)):
+            weight = weights[n]
+            red += weight * colours[n, 0]
+            green += weight * colours[n, 1]
+            blue += weight * colours[n, 2]
+            sum_ += weight
+            far += weight * t[n]
+        rest = float32(1) - sum_
+        out[ray, 0] = red + rest * background[ray, 0]
+        out[ray, 1] = green + rest * background[ray, 1]
+        out[ray, 2] = blue + rest * background[ray, 2]
+        opacity[ray], depth[ray] = sum_, far
 
 
 @kernel
-def _pixels_backward(table: Any) -> None:
+def _pixels_backward(
+    task: int, offsets: Vector[int64], weights: Vector[float32], colours: Matrix[float32], t: Vector[float32],
+    background: Matrix[float32], g: Matrix[float32], of_opacity: Vector[float32], of_depth: Vector[float32],
+    of_weights: Vector[float32], of_colours: Matrix[float32],
+) -> None:  # fmt: skip
     """Arguments as of `_pixels_forward`, with gradients for the results; gradients of weights and colours."""
-    offsets, weights = vector(table, 0, int64), vector(table, 1, float32)
-    colours, t, background = matrix(table, 2, float32), vector(table, 3, float32), matrix(table, 4, float32)
-    g, of_opacity, of_depth = matrix(table, 5, float32), vector(table, 6, float32), vector(table, 7, float32)
-    of_weights, of_colours = vector(table, 8, float32), matrix(table, 9, float32)
     rays, samples = offsets.shape[0] - 1, weights.shape[0]
-    while True:
-        task = next_task(table)
-        if task < 0:
-            break
-        for ray in range(task * _RAYS, min((task + 1) * _RAYS, rays)):
-            red, green, blue = g[ray, 0], g[ray, 1], g[ray, 2]
-            hidden = red * background[ray, 0] + green * background[ray, 1] + blue * background[ray, 2]
-            base, slope = of_opacity[ray] - hidden, of_depth[ray]
-            for n in range(max(offsets[ray], 0), min(offsets[ray + 1], samples)):
-                weight = weights[n]
-                seen = red * colours[n, 0] + green * colours[n, 1] + blue * colours[n, 2]
-                of_weights[n] = seen + base + slope * t[n]
-                of_colours[n, 0] = weight * red
-                of_colours[n, 1] = weight * green
-                of_colours[n, 2] = weight * blue
+    for ray in range(task * _RAYS, min((task + 1) * _RAYS, rays)):
+        red, green, blue = g[ray, 0], g[ray, 1], g[ray, 2]
+        hidden = red * background[ray, 0] + green * background[ray, 1] + blue * background[ray, 2]
+        base, slope = of_opacity[ray] - hidden, of_depth[ray]
+        for n in range(max(offsets[ray], 0), min(offsets[ray + 1], samples)):
+            weight = weights[n]
+            seen = red * colours[n, 0] + green * colours[n, 1] + blue * colours[n, 2]
+            of_weights[n] = seen + base + slope * t[n]
+            of_colours[n, 0] = weight * red
+            of_colours[n, 1] = weight * green
+            of_colours[n, 2] = weight * blue
 
 
 class _Pixels(Function):
@@ -239,20 +215,16 @@ class _Pixels(Function):
 
 
 @kernel
-def _seen(table: Any) -> None:
+def _seen(
+    task: int, offsets: Vector[int64], through: Vector[float32], bound: float32, mask: Vector[uint8],
+) -> None:  # fmt: skip
     """Whether the transmittance before each sample is at least a bound."""
-    offsets, through = vector(table, 0, int64), vector(table, 1, float32)
-    bound, mask = real(table, 2), vector(table, 3, uint8)
     rays, samples = offsets.shape[0] - 1, through.shape[0]
-    while True:
-        task = next_task(table)
-        if task < 0:
-            break
-        for ray in range(task * _RAYS, min((task + 1) * _RAYS, rays)):
-            transmittance = float32(1)
-            for n in range(max(offsets[ray], 0), min(offsets[ray + 1], samples)):
-                mask[n] = transmittance >= bound
-                transmittance *= through[n]
+    for ray in range(task * _RAYS, min((task + 1) * _RAYS, rays)):
+        transmittance = float32(1)
+        for n in range(max(offsets[ray], 0), min(offsets[ray + 1], samples)):
+            mask[n] = transmittance >= bound
+            transmittance *= through[n]
 
 
 @ops.composite_weights.register_cpu()

@@ -14,7 +14,7 @@ from gridreg.ops.cpu import cp, vm, vm_gradient
 from gridreg.ops.cpu.jit.simd import LANES
 from gridreg.ops.cpu.march import mark
 from gridreg.ops.cpu.march_density import walk
-from gridreg.ops.cpu.reductions import thin
+from gridreg.ops.cpu.reductions import round_stochastically
 from gridreg.ops.gradient_buffers import gradient_buffers, rounding_fraction
 from gridreg.ops.interpolation import suits_cpu
 from gridreg.ops.ray_marching import Activation, MarchArguments, RayMarchResult
@@ -94,7 +94,7 @@ class _Activated(torch.autograd.Function):
         density, u, *grids = ctx.saved_tensors
         # The derivative of softplus is 1 - exp(-softplus), and 0 where the density is 0: outside the box.
         upstream = torch.expm1(density / -ctx.scale).mul_(upstream).mul_(-ctx.scale)
-        upstream = thin(upstream, rounding_fraction())
+        upstream = round_stochastically(upstream, rounding_fraction())
         return (None, None, None, None, None, *_gradients(ctx, u, grids, upstream))
 
 

@@ -12,16 +12,14 @@ from torch import Tensor
 
 from gridreg.ops import ray_marching as ops
 from gridreg.ops.cpu.jit.compiler import (
-    cube,
+    Cube,
+    Matrix,
+    Vector,
     exact,
     float32,
     int64,
     kernel,
-    matrix,
-    next_task,
-    real,
     uint8,
-    vector,
 )
 from gridreg.ops.cpu.jit.launch import launch
 from gridreg.ops.cpu.march_bits import MarchBits, distance_of, next_bit, sample_at
@@ -42,28 +40,23 @@ _kept = threading.local()
 
 
 @kernel
-def _coarsen(table: Any) -> None:
+def _coarsen(a: int, cells: Cube[uint8], coarse: Cube[uint8], columns: Matrix[uint8]) -> None:
     """Mark the blocks of ``_COARSE^3`` cells in which any cell is occupied; a task is one slab of blocks."""
-    cells, coarse, columns = cube(table, 0, uint8), cube(table, 1, uint8), matrix(table, 2, uint8)
     nx, ny, nz = cells.shape
-    while True:
-        a = next_task(table)
-        if a < 0:
-            break
-        column = columns[a]
-        for b in range(coarse.shape[1]):
-            for k in range(nz):
-                column[k] = 0
-            for i in range(a * _COARSE, min(nx, (a + 1) * _COARSE)):
-                for j in range(b * _COARSE, min(ny, (b + 1) * _COARSE)):
-                    row = cells[i, j]
-                    for k in range(nz):
-                        column[k] |= row[k]
-            for c in range(coarse.shape[2]):
-                occupied = False
-                for k in range(c * _COARSE, min(nz, (c + 1) * _COARSE)):
-                    occupied |= column[k] != 0
-                coarse[a, b, c] = occupied
+    column = columns[a]
+    for b in range(coarse.shape[1]):
+        for k in range(nz):
+            column[k] = 0
+        for i in range(a * _COARSE, min(nx, (a + 1) * _COARSE)):
+            for j in range(b * _COARSE, min(ny, (b + 1) * _COARSE)):
+                row = cells[i, j]
+                for k in range(nz):
+                    column[k] |= row[k]
+        for c in range(coarse.shape[2]):
+            occupied = False
+            for k in range(c * _COARSE, min(nz, (c + 1) * _COARSE)):
+                occupied |= column[k] != 0
+            coarse[a, b, c] = occupied
 
 
 @exact
@@ -85,8 +78,8 @@ def _slab(origin: Any, direction: Any, far: Any, lower: Any, scale: Any, edge: A
 # `exact`, as contracted or reordered arithmetic would move samples across cell faces.
 @exact
 def _mark_ray(
-    o: Any, d: Any, near: Any, far: Any, shift: Any, step: Any, cells: Any, coarse: Any, box: Any, bits: Any
-) -> int:
+    o: Any, d: Any, near: Any, far: Any, shift: Any, step: Any, cells: Any, coarse: Any, box: Any, bits: Any,
+) -> int:  # fmt: skip
     """Set the bits of the kept lattice indices of one ray and return their number."""
     nx, ny, nz = cells.shape
     edge_x, edge_y, edge_z = np.float32(nx), np.float32(ny), np.float32(nz)
@@ -135,41 +128,32 @@ def _mark_ray(
 
 
 @kernel
-def _mark(table: Any) -> None:
+def _mark(
+    task: int, o: Matrix[float32], d: Matrix[float32], near: Vector[float32], far: Vector[float32],
+    shift: Vector[float32], step: float32, cells: Cube[uint8], coarse: Cube[uint8], box: Matrix[float32],
+    bits: Matrix[int64], counts: Vector[int64],
+) -> None:  # fmt: skip
     """Find the samples of blocks of rays: bits of their lattice indices, and their counts."""
-    o, d = matrix(table, 0, float32), matrix(table, 1, float32)
-    near, far, shift = vector(table, 2, float32), vector(table, 3, float32), vector(table, 4, float32)
-    step = real(table, 5)
-    cells, coarse, box = cube(table, 6, uint8), cube(table, 7, uint8), matrix(table, 8, float32)
-    bits, counts = matrix(table, 9, int64), vector(table, 10, int64)
-    while True:
-        task = next_task(table)
-        if task < 0:
-            break
-        for ray in range(task * _RAYS, min((task + 1) * _RAYS, o.shape[0])):
-            counts[ray] = _mark_ray(
-                o[ray], d[ray], near[ray], far[ray], shift[ray], step, cells, coarse, box, bits[ray]
-            )
+    for ray in range(task * _RAYS, min((task + 1) * _RAYS, o.shape[0])):
+        counts[ray] = _mark_ray(
+            o[ray], d[ray], near[ray], far[ray], shift[ray], step, cells, coarse, box, bits[ray]
+        )
 
 
 @kernel
-def _fill(table: Any) -> None:
+def _fill(
+    task: int, o: Matrix[float32], d: Matrix[float32], near: Vector[float32], shift: Vector[float32],
+    step: float32, bits: Matrix[int64], offsets: Vector[int64], index: Vector[int64], t: Vector[float32],
+    x: Matrix[float32],
+) -> None:  # fmt: skip
     """Write out the marked samples of blocks of rays."""
-    o, d = matrix(table, 0, float32), matrix(table, 1, float32)
-    near, shift, step = vector(table, 2, float32), vector(table, 3, float32), real(table, 4)
-    bits, offsets = matrix(table, 5, int64), vector(table, 6, int64)
-    index, t, x = vector(table, 7, int64), vector(table, 8, float32), matrix(table, 9, float32)
-    while True:
-        task = next_task(table)
-        if task < 0:
-            break
-        for ray in range(task * _RAYS, min((task + 1) * _RAYS, o.shape[0])):
-            i = int64(-1)
-            for n in range(offsets[ray], offsets[ray + 1]):
-                i = next_bit(bits[ray], i + 1)
-                index[n], t[n] = i, distance_of(near[ray], shift[ray], step, i)
-                for axis in range(3):
-                    x[n, axis] = sample_at(o[ray], d[ray], axis, t[n])
+    for ray in range(task * _RAYS, min((task + 1) * _RAYS, o.shape[0])):
+        i = int64(-1)
+        for n in range(offsets[ray], offsets[ray + 1]):
+            i = next_bit(bits[ray], i + 1)
+            index[n], t[n] = i, distance_of(near[ray], shift[ray], step, i)
+            for axis in range(3):
+                x[n, axis] = sample_at(o[ray], d[ray], axis, t[n])
 
 
 class _Blocks(NamedTuple):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd import Function
@@ -12,107 +11,102 @@ from torch.autograd.function import once_differentiable
 
 from gridreg.ops import merging as ops
 from gridreg.ops.cpu.jit.compiler import (
+    Matrix,
+    Vector,
     float32,
+    float64,
     inline,
     int64,
-    integer,
     kernel,
-    matrix,
-    next_task,
-    real,
-    vector,
 )
 from gridreg.ops.cpu.jit.launch import launch
 
 __all__ = ["merge_samples", "spread_to_samples"]
 
-# Rays of one task; samples or pools of one.
+# Rays of one task; samples or groups of one.
 _RAYS = 64
 _SAMPLES = 4096
 
 
 @inline
-def _amount(weight: Any) -> Any:
+def _amount(weight: float32) -> int64:
     """A weight as an integer, at least 1."""
-    return max(int64(np.float64(weight) * ops.UNIT), int64(1))
+    return max(int64(float64(weight) * ops.UNIT), int64(1))
 
 
 @inline
-def _next_pool(weights: Any, n: int, end: int, floor: Any, bound: Any, unit: int, passed: int) -> Any:
-    """Of the pool that begins at sample n, which weighs more than the floor: total, sample behind it, passed then.
+def _merge_next(
+    weights: Vector[float32], n: int, end: int, floor: float32, bound: float32, unit: int, passed: int
+) -> tuple[int, int, int]:
+    """Merge consecutive low-weight samples, starting at ``n``, which weighs more than the floor.
 
-    ``passed``: total of the ray's faint samples before.
+    Args:
+        passed: total weight of the ray's low-weight samples before.
+
+    Returns:
+        Their total weight, the index after the last one, and ``passed`` there.
     """
     if weights[n] >= bound:
         return _amount(weights[n]), n + 1, passed
-    bucket, sum_ = passed // unit, int64(0)
+    bucket, total = passed // unit, int64(0)
     while n < end:
         if weights[n] > floor:
             if weights[n] >= bound or passed // unit != bucket:
                 break
             amount = _amount(weights[n])
-            sum_ += amount
+            total += amount
             passed += amount
         n += 1
-    return sum_, n, passed
+    return total, n, passed
 
 
 @kernel
-def _count(table: Any) -> None:
-    """Offsets, weights, counts ``(R,)`` of pools, floor, bound, unit."""
-    offsets, weights, counts = vector(table, 0, int64), vector(table, 1, float32), vector(table, 2, int64)
-    floor, bound, unit = float32(real(table, 3)), float32(real(table, 4)), integer(table, 5)
+def _count(
+    task: int, offsets: Vector[int64], weights: Vector[float32], floor: float32, bound: float32, unit: int64,
+    counts: Vector[int64],
+) -> None:  # fmt: skip
+    """Count the groups of each ray."""
     rays = counts.shape[0]
-    while True:
-        task = next_task(table)
-        if task < 0:
-            break
-        for ray in range(task * _RAYS, min((task + 1) * _RAYS, rays)):
-            found, n, end, passed = int64(0), offsets[ray], offsets[ray + 1], int64(0)
-            while n < end:
-                if weights[n] > floor:
-                    _, n, passed = _next_pool(weights, n, end, floor, bound, unit, passed)
-                    found += 1
-                else:
-                    n += 1
-            counts[ray] = found
+    for ray in range(task * _RAYS, min((task + 1) * _RAYS, rays)):
+        found, n, end, passed = int64(0), offsets[ray], offsets[ray + 1], int64(0)
+        while n < end:
+            if weights[n] > floor:
+                _, n, passed = _merge_next(weights, n, end, floor, bound, unit, passed)
+                found += 1
+            else:
+                n += 1
+        counts[ray] = found
 
 
 @kernel
-def _fill(table: Any) -> None:
-    """As `_count`, with the first pool of each ray ``(R + 1,)`` for the counts; then numbers in [0, 1) or none, and the
-    results: speakers, their rays, pool of each sample."""
-    offsets, weights, starts = vector(table, 0, int64), vector(table, 1, float32), vector(table, 2, int64)
-    floor, bound, unit = float32(real(table, 3)), float32(real(table, 4)), integer(table, 5)
-    drawn = vector(table, 6, np.float64)
-    speakers, of_ray, pools = vector(table, 7, int64), vector(table, 8, int64), vector(table, 9, int64)
-    rays = starts.shape[0] - 1
-    while True:
-        task = next_task(table)
-        if task < 0:
-            break
-        for ray in range(task * _RAYS, min((task + 1) * _RAYS, rays)):
-            pool, n, end, passed = starts[ray], offsets[ray], offsets[ray + 1], int64(0)
-            while n < end:
-                if not weights[n] > floor:
-                    pools[n] = -1
-                    n += 1
-                    continue
-                total, behind, passed = _next_pool(weights, n, end, floor, bound, unit, passed)
-                share = total // 2
-                if drawn.shape[0] > 0:
-                    share = min(int64(drawn[pool] * np.float64(total)), total - 1)
-                speaker = int64(-1)
-                while n < behind:
-                    pools[n] = -1
-                    if weights[n] > floor:
-                        pools[n] = pool
-                        share -= _amount(weights[n])
-                        if share < 0 and speaker < 0:
-                            speaker = n
-                    n += 1
-                speakers[pool], of_ray[pool] = speaker, ray
-                pool += 1
+def _fill(
+    task: int, offsets: Vector[int64], weights: Vector[float32], floor: float32, bound: float32, unit: int64,
+    starts: Vector[int64], drawn: Vector[float64], representatives: Vector[int64], rays: Vector[int64],
+    groups: Vector[int64],
+) -> None:  # fmt: skip
+    """Write the groups, from the first one of each ray ``(R + 1,)`` and numbers in [0, 1) or none."""
+    for ray in range(task * _RAYS, min((task + 1) * _RAYS, starts.shape[0] - 1)):
+        group, n, end, passed = starts[ray], offsets[ray], offsets[ray + 1], int64(0)
+        while n < end:
+            if not weights[n] > floor:
+                groups[n] = -1
+                n += 1
+                continue
+            total, behind, passed = _merge_next(weights, n, end, floor, bound, unit, passed)
+            left = total // 2
+            if drawn.shape[0] > 0:
+                left = min(int64(drawn[group] * float64(total)), total - 1)
+            representative = int64(-1)
+            while n < behind:
+                groups[n] = -1
+                if weights[n] > floor:
+                    groups[n] = group
+                    left -= _amount(weights[n])
+                    if left < 0 and representative < 0:
+                        representative = n
+                n += 1
+            representatives[group], rays[group] = representative, ray
+            group += 1
 
 
 @ops.merge_samples.register_cpu()
@@ -121,78 +115,68 @@ def merge_samples(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """See `gridreg.ops.merge_samples`."""
     weights, offsets = weights.detach().contiguous(), offsets.contiguous()
-    rays = offsets.shape[0] - 1
-    starts = torch.zeros(rays + 1, dtype=torch.int64)
-    tasks = -(-rays // _RAYS)
-    numbers = (float(floor), float(bound), max(1, int(bound * ops.UNIT)))
-    launch(_count, tasks, offsets, weights, starts[1:], *numbers)
+    starts = torch.zeros(offsets.shape[0], dtype=torch.int64)
+    tasks = -(-(len(offsets) - 1) // _RAYS)
+    settings = (offsets, weights, float(floor), float(bound), max(1, int(bound * ops.UNIT)))
+    launch(_count, tasks, *settings, starts[1:])
     torch.cumsum(starts[1:], 0, out=starts[1:])
     count = int(starts[-1])
     drawn = torch.empty(0, dtype=torch.float64)
     if generator is not None and bound > floor:
         drawn = torch.rand(count, generator=generator, dtype=torch.float64)
-    speakers, of_ray = torch.empty(2, count, dtype=torch.int64)
-    pools = torch.empty(weights.shape[0], dtype=torch.int64)
-    launch(_fill, tasks, offsets, weights, starts, *numbers, drawn, speakers, of_ray, pools)
-    return speakers, of_ray, pools
+    representatives, rays = torch.empty(2, count, dtype=torch.int64)
+    groups = torch.empty(weights.shape[0], dtype=torch.int64)
+    launch(_fill, tasks, *settings, starts, drawn, representatives, rays, groups)
+    return representatives, rays, groups
 
 
 @kernel
-def _spread(table: Any) -> None:
-    """Colours ``(P, C)``, pool of each sample, colours of the samples ``(N, C)``."""
-    colours, pools = matrix(table, 0, float32), vector(table, 1, int64)
-    out = matrix(table, 2, float32)
+def _spread(task: int, colours: Matrix[float32], groups: Vector[int64], out: Matrix[float32]) -> None:
+    """Copy colours ``(G, C)`` to the samples of each group ``(N, C)``."""
     channels = out.shape[1]
-    while True:
-        task = next_task(table)
-        if task < 0:
-            break
-        for n in range(task * _SAMPLES, min((task + 1) * _SAMPLES, out.shape[0])):
-            number = pools[n]
-            for k in range(channels):
-                out[n, k] = colours[number, k] if number >= 0 else float32(0)
+    for n in range(task * _SAMPLES, min((task + 1) * _SAMPLES, out.shape[0])):
+        group = groups[n]
+        for k in range(channels):
+            out[n, k] = colours[group, k] if group >= 0 else float32(0)
 
 
 @kernel
-def _gather(table: Any) -> None:
-    """Speakers, gradients of samples ``(N, C)``, pool of each sample; gradients of colours ``(P, C)``."""
-    speakers, gradient = vector(table, 0, int64), matrix(table, 1, float32)
-    pools, out = vector(table, 2, int64), matrix(table, 3, float32)
+def _gather(
+    task: int, gradient: Matrix[float32], groups: Vector[int64], representatives: Vector[int64],
+    out: Matrix[float32],
+) -> None:  # fmt: skip
+    """Add the gradients of samples ``(N, C)`` up by group ``(G, C)``."""
     channels, samples = out.shape[1], gradient.shape[0]
-    while True:
-        task = next_task(table)
-        if task < 0:
-            break
-        for number in range(task * _SAMPLES, min((task + 1) * _SAMPLES, out.shape[0])):
-            # A pool lies around its speaker, with nothing between its members but what is in no pool.
-            first = speakers[number]
-            while first > 0 and (pools[first - 1] == number or pools[first - 1] < 0):
-                first -= 1
-            for k in range(channels):
-                out[number, k] = float32(0)
-            n = first
-            while n < samples and (pools[n] == number or pools[n] < 0):
-                if pools[n] == number:
-                    for k in range(channels):
-                        out[number, k] += gradient[n, k]
-                n += 1
+    for group in range(task * _SAMPLES, min((task + 1) * _SAMPLES, out.shape[0])):
+        # A group lies around its representative, with nothing between its samples but what is in no group.
+        first = representatives[group]
+        while first > 0 and (groups[first - 1] == group or groups[first - 1] < 0):
+            first -= 1
+        for k in range(channels):
+            out[group, k] = float32(0)
+        n = first
+        while n < samples and (groups[n] == group or groups[n] < 0):
+            if groups[n] == group:
+                for k in range(channels):
+                    out[group, k] += gradient[n, k]
+            n += 1
 
 
 class _Spread(Function):
     @staticmethod
-    def forward(ctx: Any, colours: Tensor, pools: Tensor, speakers: Tensor) -> Tensor:
-        ctx.save_for_backward(pools, speakers)
-        out = torch.empty(pools.shape[0], colours.shape[1])
-        launch(_spread, -(-len(pools) // _SAMPLES), colours.detach().contiguous(), pools, out)
+    def forward(ctx: Any, colours: Tensor, groups: Tensor, representatives: Tensor) -> Tensor:
+        ctx.save_for_backward(groups, representatives)
+        out = torch.empty(groups.shape[0], colours.shape[1])
+        launch(_spread, -(-len(groups) // _SAMPLES), colours.detach().contiguous(), groups, out)
         return out
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
-        pools, speakers = ctx.saved_tensors
-        out = torch.empty(speakers.shape[0], gradient.shape[1])
-        tasks = -(-len(speakers) // _SAMPLES)
-        launch(_gather, tasks, speakers, gradient.contiguous(), pools, out)
+        groups, representatives = ctx.saved_tensors
+        out = torch.empty(representatives.shape[0], gradient.shape[1])
+        tasks = -(-len(representatives) // _SAMPLES)
+        launch(_gather, tasks, gradient.contiguous(), groups, representatives, out)
         return out, None, None
 
 

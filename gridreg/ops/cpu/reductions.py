@@ -1,30 +1,27 @@
-"""What tasks have summed apart, added up; and gradients of which only what counts is left."""
+"""Sums over parts that tasks have written apart, and stochastic rounding of small gradients."""
 
 from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from gridreg.ops.cpu.jit.bfloat16 import get
 from gridreg.ops.cpu.jit.compiler import (
+    Matrix,
+    Vector,
     float32,
+    float64,
     inline,
     int32,
     int64,
     kernel,
-    matrix,
-    next_task,
-    real,
-    size,
-    vector,
 )
 from gridreg.ops.cpu.jit.launch import launch
 from gridreg.ops.cpu.jit.simd import LANES, load, one, store, wide
 
-__all__ = ["add_rows", "fold", "thin"]
+__all__ = ["add_rows", "reduce_sum", "round_stochastically"]
 
 # Elements of one task.
 _PIECE = 4096
@@ -42,7 +39,7 @@ def add_rows(x: Any, width: Any, first: Any, count: Any, totals: Any, total: Any
 
 
 @inline
-def _fold_step(x: Any, out: Any, i: int, parts: int, stride: int, zero: Any) -> None:
+def _reduce_step(x: Any, out: Any, i: int, parts: int, stride: int, zero: Any) -> None:
     total = zero
     for part in range(parts):
         total = total + load(x, part * stride + i, zero)
@@ -50,41 +47,32 @@ def _fold_step(x: Any, out: Any, i: int, parts: int, stride: int, zero: Any) -> 
 
 
 @kernel
-def _fold(table: Any) -> None:
-    """Parts ``(T, M)``, their sum ``(M,)``."""
-    x, out = vector(table, 0, float32), vector(table, 1, float32)
-    parts, stride = size(table, 0, 0), size(table, 0, 1)
-    while True:
-        task = next_task(table)
-        if task < 0:
-            break
-        first, last = task * _PIECE, min((task + 1) * _PIECE, stride)
-        split = last - (last - first) % LANES
-        for i in range(first, split, LANES):
-            _fold_step(x, out, i, parts, stride, wide())
-        for i in range(split, last):
-            _fold_step(x, out, i, parts, stride, one())
+def _reduce(task: int, x: Vector[float32], out: Vector[float32]) -> None:
+    """Add up parts ``(T, M)`` to ``(M,)``."""
+    stride = out.shape[0]
+    parts = x.shape[0] // stride
+    first, last = task * _PIECE, min((task + 1) * _PIECE, stride)
+    split = last - (last - first) % LANES
+    for i in range(first, split, LANES):
+        _reduce_step(x, out, i, parts, stride, wide())
+    for i in range(split, last):
+        _reduce_step(x, out, i, parts, stride, one())
 
 
-def fold(parts: Tensor) -> Tensor:
+def reduce_sum(parts: Tensor) -> Tensor:
     """Sum over the first axis of a contiguous float32 tensor, one part after another."""
     out = torch.empty(parts.shape[1:])
-    launch(_fold, -(-out.numel() // _PIECE), parts.view(len(parts), -1), out)
+    launch(_reduce, -(-out.numel() // _PIECE), parts.view(len(parts), -1), out)
     return out
 
 
 @kernel
-def _measure(table: Any) -> None:
-    """Values, sum of their sizes by task ``(tasks, 1)``."""
-    x, sums = vector(table, 0, float32), matrix(table, 1, np.float64)
-    while True:
-        task = next_task(table)
-        if task < 0:
-            break
-        total = 0.0
-        for n in range(task * _PIECE, min((task + 1) * _PIECE, x.shape[0])):
-            total += abs(x[n])
-        sums[task, 0] = total
+def _measure(task: int, x: Vector[float32], sums: Matrix[float64]) -> None:
+    """Add up the sizes of values by task, ``(tasks, 1)``."""
+    total = 0.0
+    for n in range(task * _PIECE, min((task + 1) * _PIECE, x.shape[0])):
+        total += abs(x[n])
+    sums[task, 0] = total
 
 
 @inline
@@ -98,37 +86,32 @@ def _mixed(bits: Any, place: Any) -> Any:
 
 
 @kernel
-def _thin(table: Any) -> None:
-    """Values, the same as integers, floor: values below it become 0 or the floor."""
-    x, bits, floor = vector(table, 0, float32), vector(table, 1, int32), real(table, 2)
-    while True:
-        task = next_task(table)
-        if task < 0:
-            break
-        for n in range(task * _PIECE, min((task + 1) * _PIECE, x.shape[0])):
-            value = np.float64(x[n])
-            if abs(value) < floor:
-                drawn = np.float64(_mixed(int64(bits[n]), n)) * 2.0**-32 * floor
-                kept = floor if value > 0 else -floor
-                x[n] = float32(kept) if drawn < abs(value) else float32(0)
+def _round(task: int, x: Vector[float32], bits: Vector[int32], floor: float32) -> None:
+    """Make of values below the floor 0 or the floor; ``bits`` are the values as integers."""
+    for n in range(task * _PIECE, min((task + 1) * _PIECE, x.shape[0])):
+        value = float64(x[n])
+        if abs(value) < floor:
+            drawn = float64(_mixed(int64(bits[n]), n)) * 2.0**-32 * floor
+            kept = floor if value > 0 else -floor
+            x[n] = float32(kept) if drawn < abs(value) else float32(0)
 
 
-def thin(values: Tensor, share: float) -> Tensor:
-    """Round small values at random, so that most are 0 and their expectation stays.
+def round_stochastically(values: Tensor, fraction: float) -> Tensor:
+    """Stochastic rounding of small values, so that most are 0 and their expectation stays.
 
-    A value smaller than the floor, ``share`` of the mean size, becomes the floor with its sign with probability
+    A value smaller than the floor, ``fraction`` of the mean size, becomes the floor with its sign with probability
     ``size / floor``, and 0 otherwise. The draw comes from the value's own bits and its place: the same values are
     rounded in the same way.
 
     Args:
         values: ``(N,)`` contiguous float32; overwritten.
-        share: of the mean size; 0: nothing changes.
+        fraction: of the mean size; 0: nothing changes.
     """
-    if share <= 0 or not values.numel():
+    if fraction <= 0 or not values.numel():
         return values
     tasks = -(-values.numel() // _PIECE)
     sums = torch.empty(tasks, 1, dtype=torch.float64)
     launch(_measure, tasks, values, sums)
-    floor = share * float(sums.sum()) / values.numel()
-    launch(_thin, tasks, values, values.view(torch.int32), floor)
+    floor = fraction * float(sums.sum()) / values.numel()
+    launch(_round, tasks, values, values.view(torch.int32), floor)
     return values

@@ -28,7 +28,7 @@ from gridreg.ops.cpu.jit.compiler import (
 from gridreg.ops.cpu.jit.launch import launch
 from gridreg.ops.cpu.jit.simd import LANES, load, one, store, wide
 from gridreg.ops.cpu.jit.workspace import room
-from gridreg.ops.cpu.reductions import fold
+from gridreg.ops.cpu.reductions import reduce_sum
 
 __all__ = ["density_backward", "features_backward"]
 
@@ -185,7 +185,7 @@ def _run(
         waste,
         alone=u.shape[0] < ALONE,
     )
-    return list(torch.split(fold(copies), nodes))
+    return list(torch.split(reduce_sum(copies), nodes))
 
 
 def density_backward(

@@ -1,31 +1,32 @@
 """How kernels are compiled, and how they read their arguments.
 
-A kernel is a function of one argument, the table that `gridreg.ops.cpu.jit.launch.launch` fills. It begins by naming
-its arguments by their position and then serves tasks until there are none::
+A kernel is a function of a task's number and of typed arguments::
 
     @kernel
-    def _scale(table):
-        x = vector(table, 0, float32)
-        factor = real(table, 1)
-        while True:
-            task = next_task(table)
-            if task < 0:
-                break
-            ...
+    def _scale(task: int, x: Vector[float32], factor: float32) -> None:
+        for n in range(task * 64, min((task + 1) * 64, x.shape[0])):
+            x[n] *= factor
+
+`gridreg.ops.cpu.jit.launch.launch` gives it the arguments in this order, by a table in memory; any number of threads
+serve tasks until there are none. A last argument annotated `Table` is that table itself, for a kernel whose number of
+arguments varies; it reads further arguments by their position, with `vector` and its like.
 
 Kernels are compiled on their first use and cached on disk. Functions that they call are marked with `inline`. What
-reads the table is generated, not compiled: each function that numba has to compile costs the first run some hundredths
-of a second, and a slice or a new array in a kernel costs several.
+reads the table is written into the kernel's own source, and generated: each function that numba has to compile costs
+the first run some hundredths of a second, and a slice or a new array in a kernel costs several.
 """
 
 from __future__ import annotations
 
+import ast
 import functools
+import inspect
+import textwrap
 import threading
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
@@ -33,14 +34,20 @@ from numba import cfunc, extending, njit, types
 from numba.core.caching import FunctionCache
 from numba.core.errors import NumbaWarning
 from numba.np import arrayobj
+from numpy import float32, float64, int32, int64, uint8, uint16
 
 from gridreg.ops.cpu.jit.cache import can_lock, forget_outdated, one_process
 
 __all__ = [
+    "Cube",
     "Kernel",
+    "Matrix",
+    "Table",
+    "Vector",
     "cube",
     "exact",
     "float32",
+    "float64",
     "inline",
     "int32",
     "int64",
@@ -57,7 +64,12 @@ __all__ = [
     "vector",
 ]
 
-float32, int32, int64, uint8, uint16 = np.float32, np.int32, np.int64, np.uint8, np.uint16
+_T = TypeVar("_T", bound=np.generic)
+# Tensors as kernels see them: all elements in one row, or two or three axes.
+Vector: TypeAlias = np.ndarray[Any, np.dtype[_T]]
+Matrix: TypeAlias = np.ndarray[Any, np.dtype[_T]]
+Cube: TypeAlias = np.ndarray[Any, np.dtype[_T]]
+Table: TypeAlias = Any
 
 # Reordering and contraction make sums fast; not-a-number and infinity keep their meaning, as a run must see them.
 _FAST = {"contract", "nsz", "arcp", "reassoc"}
@@ -78,10 +90,10 @@ class Kernel:
     """A compiled kernel; use it as a decorator, `kernel`.
 
     Args:
-        function: takes the table, returns nothing.
+        function: takes a task's number and typed arguments, returns nothing.
     """
 
-    def __init__(self, function: Callable[[Any], None]) -> None:
+    def __init__(self, function: Callable[..., None]) -> None:
         self.function = function
         self.__doc__ = function.__doc__
         self._compiled: Any = None
@@ -116,6 +128,7 @@ class Kernel:
 
     def _compile(self) -> Any:
         compiled: Any = functools.partial(cfunc, types.void(_TABLE), fastmath=_FAST, **_OPTIONS)
+        serving = _serving(self.function)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NumbaWarning)
             try:
@@ -125,13 +138,57 @@ class Kernel:
                 if empty and can_lock() and self.function.__module__.startswith(_OPERATIONS):
                     _compile_ahead()
                 with one_process(folder, self.name):
-                    return compiled(cache=True)(self.function)
+                    return compiled(cache=True)(serving)
             except (RuntimeError, OSError):
                 # No folder to keep a cache in: neither beside the source nor in the user's.
-                return compiled(cache=False)(self.function)
+                return compiled(cache=False)(serving)
 
 
 kernel = Kernel
+
+
+def _reading(annotation: str, place: int) -> str:
+    """Source that reads the argument at ``place`` of the table."""
+    kind, _, rest = annotation.partition("[")
+    if kind == "Table":
+        return "_table"
+    if rest:
+        return f"_{kind.lower()}(_table, {place}, {rest[:-1]})"
+    return f"_integer(_table, {place})" if kind.startswith("int") else f"_real(_table, {place})"
+
+
+def _serving(function: Callable[..., None]) -> Callable[[Any], None]:
+    """The function of one table that reads the arguments of a kernel and runs it for one task after another.
+
+    The kernel's own source between a few lines in front, under the same file and line numbers, by which numba caches.
+    """
+    lines, first = inspect.getsourcelines(function)
+    tree = ast.parse(textwrap.dedent("".join(lines)))
+    ast.increment_lineno(tree, first - 1)
+    (definition,) = tree.body
+    assert isinstance(definition, ast.FunctionDef)
+    task, *arguments = definition.args.args
+    if task.arg == "table":
+        return function
+    reads = [
+        f"    {argument.arg} = {_reading(ast.unparse(argument.annotation or ast.Name('Table')), place)}\n"
+        for place, argument in enumerate(arguments)
+    ]
+    frame = ast.parse(
+        f"def {definition.name}(_table):\n{''.join(reads)}    while True:\n        {task.arg} = _next_task(_table)\n"
+        f"        if {task.arg} < 0:\n            break\n"
+    )
+    for node in ast.walk(frame):
+        if isinstance(node, ast.stmt | ast.expr | ast.arg):
+            node.lineno = node.end_lineno = definition.lineno
+    (outer,) = frame.body
+    assert isinstance(outer, ast.FunctionDef)
+    assert isinstance(outer.body[-1], ast.While)
+    outer.body[-1].body += definition.body[1:] if ast.get_docstring(definition) else definition.body
+    readers = (next_task, vector, matrix, cube, integer, real)
+    namespace = function.__globals__ | {f"_{reader.__name__}": reader for reader in readers}
+    exec(compile(frame, function.__code__.co_filename, "exec"), namespace)
+    return namespace[definition.name]  # type: ignore[no-any-return]
 
 
 @functools.cache

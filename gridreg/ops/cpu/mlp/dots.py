@@ -45,7 +45,7 @@ from gridreg.ops.cpu.mlp.gemm_bf16 import (
     take,
 )
 from gridreg.ops.cpu.mlp.gemm_tile import ROWS, SUMMED, TASKS, WIDEST
-from gridreg.ops.cpu.reductions import add_rows, fold
+from gridreg.ops.cpu.reductions import add_rows, reduce_sum
 
 __all__ = ["WIDEST", "available", "multiply", "pack", "weight_gradient"]
 
@@ -185,4 +185,4 @@ def weight_gradient(slope: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
     out = torch.empty(TASKS, _up(slope.shape[1], 16), _up(x.shape[1], 16))
     totals = torch.empty(TASKS, slope.shape[1])
     launch(_sum_rows, TASKS, slope, x, out, totals)
-    return fold(out)[: slope.shape[1], : x.shape[1]], fold(totals)
+    return reduce_sum(out)[: slope.shape[1], : x.shape[1]], reduce_sum(totals)

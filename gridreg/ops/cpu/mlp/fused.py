@@ -25,7 +25,7 @@ from gridreg.ops.cpu.mlp import fused_f32 as perceptron_float
 from gridreg.ops.cpu.mlp import gemm_bf16 as dot_blocks
 from gridreg.ops.cpu.mlp import gemm_f32 as fma_blocks
 from gridreg.ops.cpu.mlp.gemm_tile import ROWS, TASKS, WIDEST
-from gridreg.ops.cpu.reductions import fold
+from gridreg.ops.cpu.reductions import reduce_sum
 
 __all__ = ["Block", "fits", "gradients", "perceptron", "rows_of"]
 
@@ -133,7 +133,7 @@ def gradients(
         kind.backward, TASKS, count, len(blocks), len(weights), inputs[0], gradient, columns,
         torch.zeros(_up(columns, 16)), sums, *arguments,
     )  # fmt: skip
-    found = fold(sums)
+    found = reduce_sum(sums)
     flat: list[Tensor] = []
     for weight, (begin, middle, high, width) in zip(weights, places, strict=True):
         of_weight = found[begin:middle].view(high, width)
