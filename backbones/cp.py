@@ -89,7 +89,8 @@ class CPField(TensorialField):
         found = super().sites()
         for kind in ("density", "appearance"):
             site = Site(
-                mask=parameters(f"{kind}_lines.0", dim=-1), grids=parameters(f"{kind}_lines.*", dim=-1)
+                mask=parameters(f"{kind}_lines.0", dim=-1, spatial=(0,)),
+                grids=parameters(f"{kind}_lines.*", dim=-1, spatial=(0,)),
             )
             found[kind] = found[f"{kind}.lines"] = site
         return found

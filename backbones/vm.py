@@ -112,7 +112,7 @@ class VMField(TensorialField):
         found = super().sites()
         for kind in ("density", "appearance"):
             planes = parameters(f"{kind}_planes.*", dim=-1)
-            lines = parameters(f"{kind}_lines.*", dim=-1)
+            lines = parameters(f"{kind}_lines.*", dim=-1, spatial=(0,))
             found[kind] = Site(mask=lines, grids=(planes, lines))
             found[f"{kind}.planes"] = Site(mask=planes, grids=(planes,))
             found[f"{kind}.lines"] = Site(mask=lines, grids=(lines,))

@@ -66,6 +66,21 @@ def test_every_channel_has_the_octave_it_says(order: Order, dimensions: int, oct
     assert said.count(-1) == (dimensions if own else 0)
 
 
+@pytest.mark.parametrize("order", ORDERS)
+def test_the_input_may_come_last(order: Order) -> None:
+    x = torch.rand(5, 3)
+    found = gridreg.positional_encoding(x, 2, order, include_input="last")
+    assert torch.equal(found[:, -3:], x)
+    assert torch.equal(found[:, :-3], gridreg.positional_encoding(x, 2, order, include_input=False))
+    said = gridreg.octaves_of_channels(3, 2, order, "last")
+    assert said == (*gridreg.octaves_of_channels(3, 2, order, False), -1, -1, -1)
+    module = gridreg.PositionalEncoding(3, 2, order, include_input="last")
+    assert module.channel_octaves == said
+    assert torch.equal(module(x), found)
+    with pytest.raises(gridreg.InputError, match="include_input='first': expected True, False or 'last'"):
+        gridreg.positional_encoding(x, 2, order, include_input="first")  # type: ignore[arg-type]
+
+
 def test_the_orders_hold_the_same_channels() -> None:
     x = torch.randn(4, 3, generator=torch.Generator().manual_seed(0))
     first, *others = (gridreg.positional_encoding(x, 4, order).sort(-1).values for order in ORDERS)

@@ -186,7 +186,8 @@ class Planes(nn.Module):
         return torch.einsum("xr,yzr->xyzr", self.grids[0], self.grids[1])
 
 
-LINES, PLANES = gridreg.parameters("grids.0", dim=-1), gridreg.parameters("grids.1", dim=-1)
+LINES = gridreg.parameters("grids.0", dim=-1, spatial=(0,))
+PLANES = gridreg.parameters("grids.1", dim=-1)
 
 
 class TestAttached:
@@ -255,7 +256,9 @@ class TestAttached:
 
     def test_a_place_without_spatial_axes_is_an_error(self) -> None:
         field = nn.Sequential(nn.Linear(4, 5))
-        with pytest.raises(InputError, match=r"has no spatial axis longer than 1; name its axes"):
+        with pytest.raises(
+            InputError, match=r"has no spatial axis longer than 1 \(in a table.*name its axes"
+        ):
             gridreg.apply(field, FourierLowPass(gridreg.parameters("0.bias", dim=0)), total_steps=10)
 
     @pytest.mark.parametrize(
@@ -279,3 +282,24 @@ class TestAttached:
         context.clock.step = 3
         with pytest.raises(InputError, match="keep=3 at step 3"):
             FourierLowPass("density", keep=lambda step: float(step)).number(context)
+
+
+@pytest.mark.parametrize("shape", [(1, 4, 5, 6), (1, 4, 5, 6, 7)])
+@pytest.mark.parametrize("keep", [0.2, 0.9])
+def test_a_filter_keeps_the_dtype_under_autocast_and_the_memory_format(
+    shape: tuple[int, ...], keep: float
+) -> None:
+    values = torch.randn(shape, generator=torch.Generator().manual_seed(1))
+    form = torch.channels_last if len(shape) == 4 else torch.channels_last_3d
+    axes = tuple(range(2, len(shape)))
+    expected = fourier_low_pass(values, axes, keep)
+    last = values.to(memory_format=form)
+    with torch.autocast("cpu", torch.bfloat16):
+        found, blurred = fourier_low_pass(last, axes, keep), gaussian_blur(last, axes, 0.1)
+        plain = fourier_low_pass(values, axes, keep)
+    torch.testing.assert_close(found, expected)
+    assert torch.equal(plain, expected)
+    assert found.dtype == blurred.dtype == torch.float32
+    assert found.is_contiguous(memory_format=form)
+    assert blurred.is_contiguous(memory_format=form)
+    assert plain.is_contiguous()

@@ -187,12 +187,16 @@ def test_variants_go_by_channel_index_as_their_programs_do() -> None:
     assert torch.equal(authors, gridreg.authors_frequency_mask(27, 20, 80))
 
 
-def test_cosine_mask_keeps_the_lowest_rank_open() -> None:
+def test_cosine_mask_is_barfs_window_with_the_identity_beside_it() -> None:
     with_identity = gridreg.CosineMask("x", until=80).mask(context_at(20, 9, (-1, 0, 1, 2, 3, 0, 1, 2, 3)))
     assert torch.equal(with_identity[1:5], gridreg.cosine_mask(4, 20, 80))
     assert with_identity[0] == 1
     without = gridreg.CosineMask("x", until=80).mask(context_at(0, 3, (0, 1, 2)))
-    assert without.tolist() == [1.0, 0.0, 0.0]
+    assert without.tolist() == [0.0, 0.0, 0.0]
+    half = gridreg.CosineMask("x", until=80).mask(context_at(30, 4, (0, 1, 2, 3)))
+    assert torch.equal(half, gridreg.cosine_mask(4, 30, 80))
+    unknown = gridreg.CosineMask("x", until=80).mask(context_at(0, 3))
+    assert unknown.tolist() == [1.0, 0.0, 0.0]
     assert gridreg.CosineMask("x").mask(context_at(0, 1)).tolist() == [1.0]
 
 

@@ -91,7 +91,7 @@ def test_declared_sites_have_a_mask_and_grids() -> None:
     assert names(find(field, "density", "grids")) == ["plane.0", "plane.1", "line.0", "line.1", "line.2"]
     assert list(gridreg.sites_of(field)) == ["density", "head"]
     assert find(field, "head", "grids") == []
-    grids = [match.grid() for match in find(field, "density", "grids")]
+    grids = [grid for match in find(field, "density", "grids") for grid in match.grids()]
     assert [grid.spatial for grid in grids] == [(2, 3), (2, 3), (2,), (2,), (2,)]
     assert grids[0].parameter is field.plane[0]
 
@@ -104,8 +104,11 @@ def test_declared_sites_have_a_mask_and_grids() -> None:
         ((1, 8, 5, 6, 7), 1, None, (2, 3, 4)),
         ((8, 5, 6), 0, None, (1, 2)),
         ((5, 6, 8), -1, None, (0, 1)),
-        ((5, 8), -1, None, (0,)),
-        ((5, 8), 1, None, (0,)),
+        ((5, 8), -1, (0,), (0,)),
+        # A table, of which nobody knows whether its entries are neighbours in space.
+        ((5, 8), -1, None, ()),
+        ((5, 8), 1, None, ()),
+        ((4, 5000, 8), -1, None, ()),
         ((8, 5), 0, None, (1,)),
         ((5, 6, 7, 8), -1, None, (0, 1, 2)),
         ((5, 8, 6), 1, (0, -1), (0, 2)),
@@ -128,7 +131,7 @@ def test_channels_are_a_slice_or_indices() -> None:
     assert place.selected == (5, 0)
     assert gridreg.inputs("a", channels=slice(1, 9, 2)).channels == "1:9:2"
     assert gridreg.inputs("a", channels=slice(-3, None)) == gridreg.inputs("a", channels="-3:")
-    grid = find(field, gridreg.parameters("head.0.weight", dim=1, channels=[1, 2]), "grids")[0].grid()
+    grid = find(field, gridreg.parameters("head.0.weight", dim=1, channels=[1, 2]), "grids")[0].grids()[0]
     assert torch.equal(grid.values, field.head[0].weight[:, 1:3])
 
 

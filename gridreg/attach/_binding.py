@@ -53,7 +53,7 @@ class Binding:
     @property
     def grids(self) -> list[Grid]:
         """The raw grids of its site, as they are now."""
-        return [match.grid() for match in self.matches]
+        return [grid for match in self.matches for grid in match.grids()]
 
     def value(self) -> float:
         """One number for tables and curves: the mean over its tensors; NaN until one has shown its width."""

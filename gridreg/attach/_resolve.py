@@ -19,6 +19,9 @@ __all__ = ["Match", "find", "raw_tensor", "register_adapter", "sites_of"]
 # DistributedDataParallel and DataParallel, and torch.compile.
 _WRAPPERS = re.compile(r"^((module|_orig_mod)\.)+")
 
+# No grid has so many nodes along an edge: an axis beyond is the entries of a table.
+_LONGEST_EDGE = 4096
+
 Adapter: TypeAlias = Callable[[nn.Module], Mapping[str, "Site | Selector"]]
 
 _ADAPTERS: dict[type[nn.Module], Adapter] = {}
@@ -32,15 +35,20 @@ class Match:
     module: nn.Module
     attribute: str
 
-    def grid(self) -> Grid:
-        """The raw tensor behind this place."""
-        return Grid(
-            self.place.name,
-            raw_tensor(self.module, self.attribute),
-            self.place.dim,
-            self.place.spatial,
-            self.place.selected,
-        )
+    def grids(self) -> list[Grid]:
+        """The raw tensor behind this place, or each grid of a stack."""
+        place, tensor = self.place, raw_tensor(self.module, self.attribute)
+        stack = place.stack
+        if stack is None:
+            return [Grid(place.name, tensor, place.dim, place.spatial, place.selected)]
+        dim = place.dim - (place.dim > stack)
+        spatial = tuple(axis - (axis > stack) for axis in place.spatial)
+        item = place.selector.item
+        return [
+            Grid(f"{place.name}[{i}]", tensor, dim, spatial, place.selected, (stack, i))
+            for i in range(tensor.shape[stack])
+            if item is None or i == item
+        ]
 
 
 def raw_tensor(module: nn.Module, attribute: str) -> Tensor:
@@ -183,8 +191,9 @@ def _find_parameters(field: nn.Module, selector: Selector) -> list[Match]:
     matches = []
     for name, tensor in tensors.items():
         path, _, attribute = name.rpartition(".")
-        spatial = _spatial_axes(tensor, dims[name], selector.spatial)
-        place = Place(name, selector, dims[name], spatial, selector.octaves)
+        stack = _checked_stack(name, tensor, dims[name], selector)
+        spatial = _spatial_axes(tensor, dims[name], selector.spatial, stack)
+        place = Place(name, selector, dims[name], spatial, selector.octaves, stack=stack)
         place.complete(tensor.shape[dims[name]])
         matches.append(Match(place, field.get_submodule(path), attribute))
     return matches
@@ -251,10 +260,31 @@ def _check_sizes(tensors: Mapping[str, Tensor], dims: Mapping[str, int], selecto
         )
 
 
-def _spatial_axes(tensor: Tensor, dim: int, spatial: tuple[int, ...] | None) -> tuple[int, ...]:
-    """Spatial axes of a grid: given, or after a leading channel axis, or before a trailing one."""
+def _checked_stack(name: str, tensor: Tensor, dim: int, selector: Selector) -> int | None:
+    """The axis of a stack, not negative; refused where it is another axis, or the item is not in it."""
+    if selector.stack is None:
+        return None
+    shape, count = tuple(tensor.shape), tensor.ndim
+    axis = selector.stack % count if -count <= selector.stack < count else count
+    others = (dim, *(other % count for other in selector.spatial or ()))
+    if axis == count or axis in others:
+        raise InputError(
+            f"stack={selector.stack} of {selector}: {name} has shape {shape}; expected another axis"
+        )
+    if selector.item is not None and selector.item not in range(shape[axis]):
+        raise InputError(f"item={selector.item!r} of {selector}: {name} holds {shape[axis]} grids, from 0")
+    return axis
+
+
+def _spatial_axes(
+    tensor: Tensor, dim: int, spatial: tuple[int, ...] | None, stack: int | None
+) -> tuple[int, ...]:
+    """Spatial axes of a grid: given, or after a leading channel axis, or before a trailing one; none of a table."""
     if spatial is not None:
         return tuple(sorted(axis % tensor.ndim for axis in spatial))
     leading = dim in (0, 1) and dim != tensor.ndim - 1
-    axes = range(dim + 1, tensor.ndim) if leading else range(dim)
+    axes = [axis for axis in (range(dim + 1, tensor.ndim) if leading else range(dim)) if axis != stack]
+    entries_by_features = dim == tensor.ndim - 1 and len(axes) == 1
+    if entries_by_features or any(tensor.shape[axis] > _LONGEST_EDGE for axis in axes):
+        return ()
     return tuple(axis for axis in axes if tensor.shape[axis] > 1)

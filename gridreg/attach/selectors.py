@@ -30,12 +30,15 @@ class Selector:
     octaves: tuple[int, ...] | None = None
     spatial: tuple[int, ...] | None = None
     item: int | str | None = None
+    stack: int | None = None
 
     def __str__(self) -> str:
         """As the user wrote it, without what is at its default."""
         text = f"{self.kind}({self.pattern!r}, dim={self.dim}"
         if self.channels is not None:
             text += f", channels={abridged(self.channels)}"
+        if self.stack is not None:
+            text += f", stack={self.stack}" + ("" if self.item is None else f", item={self.item}")
         return text + (")" if self.octaves is None else ", octaves=...)")
 
 
@@ -46,6 +49,8 @@ def parameters(
     channels: slice | Sequence[int] | str | None = None,
     octaves: Sequence[int] | None = None,
     spatial: Sequence[int] | None = None,
+    stack: int | None = None,
+    item: int | None = None,
 ) -> Selector:
     """Site: parameters (or, where no parameter matches, buffers) whose dotted names match `glob`.
 
@@ -57,12 +62,20 @@ def parameters(
         channels: channels that take part, as a slice or indices; all by default.
         octaves: octave of each channel that takes part (-1: the identity), where channels are an encoding.
         spatial: spatial axes; by default those after a leading `dim`, those before a trailing one, without
-            axes of length 1.
+            axes of length 1. Tables, `(entries, features)` or with an axis of more than 4,096 entries, have none by
+            default: what lies side by side in memory need not be neighbours in space, as in a hash grid.
+        stack: axis along which a tensor holds several grids, such as 0 for three lines in one tensor
+            `(3, C, M, 1)`: penalties then see three grids, and no axis of the stack is spatial.
+        item: with `stack`, the one grid that takes part, such as the factor of a product that a mask is to multiply.
 
-    >>> print(parameters("density_line.*", dim=1))
-    parameters('density_line.*', dim=1)
+    >>> print(parameters("density_line.*", dim=1), parameters("line_coef", dim=1, stack=0, item=0))
+    parameters('density_line.*', dim=1) parameters('line_coef', dim=1, stack=0, item=0)
     """
-    return _selector("parameters", glob, dim, channels, octaves, spatial, None)
+    if item is not None and stack is None:
+        raise InputError(
+            f"parameters({glob!r}, item={item!r}): expected the axis of the grids as well, stack=..."
+        )
+    return _selector("parameters", glob, dim, channels, octaves, spatial, item, stack)
 
 
 def outputs(
@@ -107,12 +120,14 @@ def _selector(
     octaves: Sequence[int] | None,
     spatial: Sequence[int] | None,
     item: int | str | None,
+    stack: int | None = None,
 ) -> Selector:
     """Check and normalise the arguments of the three functions above."""
     if not isinstance(glob, str):
         raise InputError(f"{kind}({glob!r}): expected a name or glob as text")
-    if isinstance(dim, bool) or not isinstance(dim, int):
-        raise InputError(f"{kind}({glob!r}, dim={dim!r}): expected the channel axis as an int")
+    for name, axis, what in (("dim", dim, "the channel axis"), ("stack", stack, "the axis of the grids")):
+        if isinstance(axis, bool) or not isinstance(axis, int if name == "dim" else int | None):
+            raise InputError(f"{kind}({glob!r}, {name}={axis!r}): expected {what} as an int")
     return Selector(
         kind,
         glob,
@@ -121,6 +136,7 @@ def _selector(
         octaves=None if octaves is None else tuple(int(octave) for octave in octaves),
         spatial=None if spatial is None else tuple(int(axis) for axis in spatial),
         item=item,
+        stack=stack,
     )
 
 

@@ -54,10 +54,11 @@ class Place:
         name: dotted name on the field, unique within its kind.
         selector: what matched it.
         dim: channel axis; not negative for parameters, as given for outputs and inputs.
-        spatial: spatial axes; empty for outputs and inputs.
+        spatial: spatial axes; empty for outputs and inputs, and for tables.
         octaves: octave of each channel that takes part, None where the site knows none.
         size: length of the channel axis; None for outputs and inputs whose length shows at the first call.
         selected: indices of the channels that take part, None for all.
+        stack: axis along which the tensor holds several grids, not negative; None: it is one.
     """
 
     name: str
@@ -67,6 +68,7 @@ class Place:
     octaves: tuple[int, ...] | None = None
     size: int | None = None
     selected: tuple[int, ...] | None = None
+    stack: int | None = None
 
     @property
     def kind(self) -> Kind:
@@ -112,9 +114,10 @@ class Grid:
     Attributes:
         name: dotted name on the field.
         parameter: the raw tensor, never masked or filtered.
-        dim: channel axis.
-        spatial: spatial axes.
+        dim: channel axis of `values`.
+        spatial: spatial axes of `values`; none for a table, whose cells need not lie in space as in memory.
         selected: indices of the channels that take part, None for all.
+        entry: where the parameter is a stack of grids: its axis, and the index of this one.
     """
 
     name: str
@@ -122,12 +125,17 @@ class Grid:
     dim: int
     spatial: tuple[int, ...]
     selected: tuple[int, ...] | None = None
+    entry: tuple[int, int] | None = None
 
     @property
     def values(self) -> Tensor:
-        """The channels that take part, same axes as `parameter`."""
+        """The grid with the channels that take part; the axes of `parameter`, without that of a stack."""
+        grid = self.parameter if self.entry is None else self.parameter.select(*self.entry)
         if self.selected is None:
-            return self.parameter
-        return self.parameter.index_select(
-            self.dim, torch.tensor(self.selected, device=self.parameter.device)
-        )
+            return grid
+        return grid.index_select(self.dim, torch.tensor(self.selected, device=grid.device))
+
+    @property
+    def whole(self) -> bool:
+        """Whether this is all of its parameter."""
+        return self.selected is None and self.entry is None

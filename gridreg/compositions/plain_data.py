@@ -20,7 +20,7 @@ _SELECTORS: dict[str, Callable[..., Selector]] = {
     "outputs": outputs,
     "inputs": inputs,
 }
-_SELECTOR_KEYS = ("dim", "channels", "octaves", "spatial", "item")
+_SELECTOR_KEYS = ("dim", "channels", "octaves", "spatial", "item", "stack")
 # YAML 1.1 reads 1e-4, without a point, as text.
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
 

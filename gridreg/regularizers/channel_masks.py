@@ -62,9 +62,9 @@ class FrequencyMask(Mask):
     def mask(self, context: Context) -> Tensor:
         """The mask over the channels that take part, shape `(channels,)`."""
         place = context.place
-        if self.variant == "block" and self.block is None and place is not None and place.octaves is None:
+        channels = 0 if place is None or place.octaves is not None else place.channels or 0
+        if self.variant == "block" and self.block is None and channels:
             # Fewer channels than a block count as one block.
-            channels = place.channels or 1
             end = context.end(self.until)
             return masks.frequency_mask(channels, context.step, end, block=min(3, channels))
         return super().mask(context)
@@ -142,11 +142,11 @@ class FixedMask(Mask):
 class CosineMask(Mask):
     """BARF's window: one octave after the other opens smoothly, along half a cosine.
 
-    The lowest rank (the identity, if the site has it) is always open; the window runs over the ranks above
-    it.
+    The identity, octave -1, is always open; the window runs over the octaves, and at step 0 all of them are closed.
+    Where a site knows no octaves, its first channel stands for the identity, and the others for octaves.
 
     Args:
-        site: where it acts; its octaves, or its channel indices where it knows none, are the ranks.
+        site: where it acts.
         until: fraction of the run (float) or step (int) from which all is open.
         detach: closed channels keep their values and only lose their gradient.
 
@@ -164,6 +164,11 @@ class CosineMask(Mask):
         """Refuse what no run could use."""
         super().__post_init__()
         check_until(self.until)
+
+    def ranks(self, place: Place) -> tuple[int, ...]:
+        """By octave where known; rank 0 is the identity's, whether or not the site has it."""
+        without = place.octaves is not None and min(place.octaves, default=0) >= 0
+        return tuple(rank + without for rank in super().ranks(place))
 
     def rank_values(self, count: int, context: Context) -> Tensor:
         """Mask over ranks."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from functools import lru_cache
 from typing import Literal, TypeAlias
 
@@ -15,6 +16,8 @@ from gridreg.errors import InputError
 __all__ = ["Boundary", "fourier_low_pass", "gaussian_blur", "low_pass_response"]
 
 Boundary: TypeAlias = Literal["periodic", "mirror"]
+
+_CHANNELS_LAST = ((4, torch.channels_last), (5, torch.channels_last_3d))
 
 # A response below this share leaves nothing that float32 could see next to the rest of the spectrum.
 _NOTHING = 1e-8
@@ -155,15 +158,22 @@ def _whole(basis: Tensor, response: Tensor) -> tuple[Tensor, ...]:
 
 
 def _filter(values: Tensor, axes: Sequence[int], factors_of: Callable[[int], tuple[Tensor, ...]]) -> Tensor:
+    """`values` multiplied along each axis by factors; in the dtype and the memory format that they have."""
     syntheses: list[tuple[Tensor, int]] = []
-    for axis in axes:
-        first, *second = factors_of(values.shape[axis])
-        # Thin factors first on all axes: each makes the grid smaller for the next.
-        syntheses += [(matrix, axis) for matrix in second]
-        values = _along(first, values, axis)
-    for matrix, axis in reversed(syntheses):
-        values = _along(matrix, values, axis)
-    return values
+    form = next(
+        (f for n, f in _CHANNELS_LAST if values.ndim == n and values.is_contiguous(memory_format=f)), None
+    )
+    contiguous = values.is_contiguous()
+    device = values.device.type
+    with torch.autocast(device, enabled=False) if torch.amp.is_autocast_available(device) else nullcontext():
+        for axis in axes:
+            first, *second = factors_of(values.shape[axis])
+            # Thin factors first on all axes: each makes the grid smaller for the next.
+            syntheses += [(matrix, axis) for matrix in second]
+            values = _along(first, values, axis)
+        for matrix, axis in reversed(syntheses):
+            values = _along(matrix, values, axis)
+    return values if form is None or contiguous else values.contiguous(memory_format=form)
 
 
 def _along(matrix: Tensor, values: Tensor, axis: int) -> Tensor:

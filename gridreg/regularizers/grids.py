@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -16,7 +16,12 @@ from gridreg.base import Context, LocalTerm, Regularizer, check_site, check_weig
 from gridreg.errors import InputError
 from gridreg.schedules import Linear, Numeric
 
-__all__ = ["L1", "Orthogonality", "TotalVariation", "l1", "orthogonality", "total_variation"]
+__all__ = ["NO_NEIGHBOURS", "L1", "Orthogonality", "TotalVariation", "l1", "orthogonality", "total_variation"]
+
+NO_NEIGHBOURS = (
+    "has no spatial axis longer than 1 (in a table, cells side by side need not be neighbours in space); "
+    "name its axes with spatial=..."
+)
 
 
 def total_variation(values: Tensor, axes: Sequence[int]) -> Tensor:
@@ -38,7 +43,7 @@ def total_variation(values: Tensor, axes: Sequence[int]) -> Tensor:
     """
     total = values.new_zeros(())
     for axis in axes:
-        if values.shape[axis] > 1:
+        if values.shape[axis] > 1 and values.numel():
             total = total + values.diff(dim=axis).square().mean()
     return total
 
@@ -56,7 +61,7 @@ def l1(values: Tensor) -> Tensor:
         >>> l1(torch.tensor([-1.0, 3.0])).item()
         2.0
     """
-    return values.abs().mean()
+    return values.abs().mean() if values.numel() else values.sum()
 
 
 class _Orthogonality(Function):
@@ -97,13 +102,24 @@ def orthogonality(lines: Tensor) -> Tensor:
 
 def _spatial(grid: Grid, who: str) -> tuple[int, ...]:
     """Axes along which a grid has neighbours."""
-    axes = tuple(axis for axis in grid.spatial if grid.parameter.shape[axis] > 1)
+    shape = tuple(grid.values.shape)
+    axes = tuple(axis for axis in grid.spatial if shape[axis] > 1)
     if not axes:
-        raise InputError(
-            f"{who}: {grid.name} of shape {tuple(grid.parameter.shape)} has no spatial axis longer than 1; "
-            "name its axes with spatial=..."
-        )
+        raise InputError(f"{who}: {grid.name} of shape {shape} {NO_NEIGHBOURS}")
     return axes
+
+
+def _others(grid: Grid, axes: Sequence[int]) -> tuple[int, ...]:
+    """Axes of a grid beside these."""
+    return tuple(axis for axis in range(grid.values.ndim) if axis not in axes)
+
+
+def _rows(grid: Grid) -> Sequence[Tensor]:
+    """Channels as rows ``(channels, nodes)``, for each of the grids that lie along further axes."""
+    values = grid.values
+    stacked = _others(grid, (grid.dim, *grid.spatial))
+    rows = values.permute(*stacked, grid.dim, *grid.spatial).flatten(len(stacked) + 1)
+    return rows.flatten(0, len(stacked) - 1).unbind() if stacked else (rows,)
 
 
 @register
@@ -155,7 +171,7 @@ class TotalVariation(Regularizer):
 
     def local_terms(self, grids: Sequence[Grid], context: Context) -> list[LocalTerm]:
         """One for each grid, if all channels take part; none in the iterations between."""
-        if context.step % self.every or any(grid.selected is not None for grid in grids):
+        if context.step % self.every or not all(grid.whole for grid in grids):
             return []
         return [
             LocalTerm("total_variation", self.every, g.parameter, _spatial(g, "TotalVariation"))
@@ -204,7 +220,7 @@ class L1(Regularizer):
 
     def local_terms(self, grids: Sequence[Grid], context: Context) -> list[LocalTerm]:
         """One for each grid, if all channels take part."""
-        if any(grid.selected is not None for grid in grids):
+        if not all(grid.whole for grid in grids):
             return []
         return [LocalTerm("l1", 1.0, grid.parameter, grid.spatial) for grid in grids]
 
@@ -220,7 +236,8 @@ class Orthogonality(Regularizer):
     """Channels of the site's lines should not repeat each other: see `orthogonality`.
 
     Lines are the grids with one spatial axis. Planes and voxels beside them are left alone, as in TensoRF;
-    at a site without lines they are taken themselves, each channel as one long row.
+    at a site without lines they are taken themselves, each channel as one long row. Channels are compared
+    within a grid: not along an axis that is neither the channels' nor spatial, on which several grids lie.
 
     Lines of zeros are orthogonal too. While a field has found no matter yet, the gradient of its images is
     weak, and this one can shrink all lines to nothing: let the weight start later (`Piecewise`).
@@ -251,8 +268,10 @@ class Orthogonality(Regularizer):
 
     def grid_penalty(self, grids: Sequence[Grid], context: Context) -> Tensor:
         """`orthogonality`, added over the lines."""
-        lines = [grid for grid in grids if len(_spatial(grid, "Orthogonality")) == 1]
-        rows = [grid.values.movedim(grid.dim, 0).flatten(1) for grid in lines or grids]
+        # A table has no neighbours, but a row for each channel all the same.
+        tabled = [replace(g, spatial=g.spatial or _others(g, (g.dim,))) for g in grids]
+        lines = [grid for grid in tabled if len(_spatial(grid, "Orthogonality")) == 1]
+        rows = [row for grid in lines or tabled for row in _rows(grid)]
         return torch.stack([orthogonality(row) for row in rows]).sum()
 
     @classmethod

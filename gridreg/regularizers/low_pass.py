@@ -14,6 +14,7 @@ from gridreg.attach.sites import SiteLike
 from gridreg.base import Context, Regularizer, check_site, register
 from gridreg.errors import InputError
 from gridreg.regularizers.filters import Boundary, fourier_low_pass, gaussian_blur
+from gridreg.regularizers.grids import NO_NEIGHBOURS
 from gridreg.schedules import Linear, Numeric, check_numeric
 
 __all__ = ["FourierLowPass", "GridBlur", "annealed_radius"]
@@ -60,9 +61,7 @@ class _GridFilter(Regularizer):
     def prepare(self, context: Context) -> None:
         """Keep the number of this step."""
         if context.place is not None and not context.place.spatial:
-            raise InputError(
-                f"{context.place.name}: has no spatial axis longer than 1; name its axes with spatial=..."
-            )
+            raise InputError(f"{context.place.name}: {NO_NEIGHBOURS}")
         number = torch.tensor(self.number(context), dtype=torch.float64)
         if "number" in context.state:
             context.state["number"].copy_(number)
@@ -83,15 +82,21 @@ def _number(context: Context) -> float | Tensor:
 def _filtered(
     value: Tensor, context: Context, function: Callable[[Tensor, tuple[int, ...]], Tensor]
 ) -> Tensor:
-    """The grid with the channels that take part filtered."""
+    """The grid with what takes part, some channels or one grid of a stack, filtered."""
     place = context.place
     if place is None:
         return value
-    if place.selected is None:
-        return function(value, place.spatial)
-    chosen = torch.tensor(place.selected, device=value.device)
-    part = function(value.index_select(place.dim, chosen), place.spatial)
-    return value.index_copy(place.dim, chosen, part)
+    item = place.selector.item
+    chosen = [(place.dim, place.selected), (place.stack, None if item is None else (item,))]
+    parts, indices = [value], []
+    for axis, selected in chosen:
+        if axis is not None and selected is not None:
+            indices.append((axis, torch.tensor(selected, device=value.device)))
+            parts.append(parts[-1].index_select(*indices[-1]))
+    result = function(parts[-1], place.spatial)
+    for part, (axis, index) in zip(parts[-2::-1], reversed(indices), strict=True):
+        result = part.index_copy(axis, index, result)
+    return result
 
 
 @register

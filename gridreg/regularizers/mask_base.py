@@ -57,6 +57,8 @@ class Mask(Regularizer):
         if context.place is None:
             raise InputError("context: a mask has one only at a place")
         ranks = self.ranks(context.place)
+        if not ranks:
+            return torch.ones(0)
         return self.rank_values(max(ranks) + 1, context)[_indices(ranks)]
 
     def prepare(self, context: Context) -> None:
@@ -74,9 +76,9 @@ class Mask(Regularizer):
         return end is not None and context.step >= end
 
     def closed_channels(self, context: Context) -> Tensor | None:
-        """Where the mask is 0."""
+        """Where the mask is 0; not told of one grid of a stack."""
         closed: Tensor = context.state["mask"] <= 0
-        return None if self.detach else closed
+        return None if self.detach or _item(context) is not None else closed
 
     def transform(self, value: Tensor, context: Context) -> Tensor:
         """Multiply the channels by the mask."""
@@ -88,8 +90,9 @@ class Mask(Regularizer):
         return torch.where(mask > 0, value * mask, 0.0)
 
     def value(self, context: Context) -> float:
-        """Open share of the channels."""
-        return float(self.mask(context).mean())
+        """Open share of the channels; 1 if there are none."""
+        mask = self.mask(context)
+        return float(mask.mean()) if len(mask) else 1.0
 
 
 class _ScaledGradient(torch.autograd.Function):
@@ -142,7 +145,22 @@ def broadcast(context: Context, name: str, value: Tensor) -> Tensor:
             f"{name}: mask of {len(factors)} for {value.shape[dim]} channels; "
             "replace parameters inside handle.suspended(), or call handle.step after it"
         )
-    shape = [1] * value.ndim
-    shape[dim] = -1
     # A copy, so that the next step may write into the state before this one's backward pass.
-    return factors.to(value.dtype, copy=True).reshape(shape)
+    factors = _along(factors.to(value.dtype, copy=True), dim, value)
+    item = _item(context)
+    if item is None or context.place is None or context.place.stack is None:
+        return factors
+    stack = context.place.stack
+    others = torch.arange(value.shape[stack], device=value.device).ne(item)
+    return torch.where(_along(others, stack, value), 1, factors)
+
+
+def _item(context: Context) -> int | None:
+    """The one grid of a stack that takes part; None: all do, or there is no stack."""
+    item = None if context.place is None or context.place.stack is None else context.place.selector.item
+    return item if isinstance(item, int) else None
+
+
+def _along(factors: Tensor, dim: int, value: Tensor) -> Tensor:
+    """A vector, shaped to multiply one axis of `value`."""
+    return factors.reshape([-1 if axis == dim % value.ndim else 1 for axis in range(value.ndim)])

@@ -221,7 +221,7 @@ def gradients(regularizer: Regularizer, subject: Subject) -> None:
     if overrides(regularizer, Regularizer.grid_penalty):
         field = subject.made().double()
         matches = [match for site in regularizer.sites() for match in find(field, site, "grids")]
-        grids = [match.grid() for match in matches]
+        grids = [grid for match in matches for grid in match.grids()]
 
         def grid_penalty(*values: Tensor) -> Tensor:
             changed = [replace(grid, parameter=v) for grid, v in zip(grids, values, strict=True)]

@@ -89,7 +89,7 @@ DESIGNS: dict[str, Design] = {
             gridreg.outputs("encoder", octaves=[0, 0, 1, 1, 2, 2, 3, 3]),
             gridreg.inputs("sigma_net.0"),
         ),
-        gridreg.parameters("encoder.levels.*.weight", dim=1),
+        gridreg.parameters("encoder.levels.*.weight", dim=1, spatial=(0,)),
         attach_hash,
     ),
     "kplanes": Design(
