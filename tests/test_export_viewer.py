@@ -59,8 +59,10 @@ class TestServer:
 
     def test_everybody_is_named_when_everybody_can_look(self, capsys):
         with Viewer(ball_model(step=100), host="0.0.0.0", port=0) as viewer:
-            assert viewer.url == f"http://127.0.0.1:{viewer.port}"
-        assert "(reached from the network)" in capsys.readouterr().err
+            assert viewer.url.startswith(f"http://127.0.0.1:{viewer.port}/?token=")
+        assert (
+            capsys.readouterr().err == f"viewer: {viewer.url} (reached from the network, with this token)\n"
+        )
 
     def test_taken_port_is_one_line(self):
         listener, port = taken_port()
@@ -216,6 +218,34 @@ class TestDrawing:
             assert name.startswith("gridreg_rgb_")
             assert name.endswith(".png")
             assert iio.imread(content).shape == (60, 80, 3)
+
+    def test_who_has_waited_longest_is_served_first(self):
+        viewer, _ = self.start()
+        with viewer:
+            clients = [FakeClient(FRONT) for _ in range(4)]
+            for number, client in enumerate(clients):
+                client.client_id = 100 + number
+                viewer._connected(client)
+            end = time.monotonic() + 4
+            while time.monotonic() < end:
+                for client in clients:
+                    client.moved(client.camera)
+                time.sleep(0.01)
+            counts = [len(client.pictures) for client in clients]
+        assert min(counts) >= 3
+        assert max(counts) <= 2 * min(counts)
+
+    def test_what_a_browser_says_is_bounded(self):
+        viewer, client = self.start()
+        with viewer:
+            panel = viewer._panel
+            panel._size.value, panel._mode.value = 9000, "no such mode"
+            assert (panel.look.size, panel.look.mode) == (1600, "rgb")
+            panel._size.value = -5
+            assert panel.look.size == 64
+            for _ in range(5):
+                viewer._wish(client)
+            assert len(viewer._wishes) <= 1
 
     def test_training_views_are_there_to_click(self):
         with Viewer(ball_model(step=100), ring_of_views(4), port=0, quiet=True) as viewer:

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
 from torch import Tensor
 
 from gridreg.errors import InputError
+from gridreg.export._admission import Admission
 from gridreg.export.cameras import Camera, Lens
 from gridreg.scenes import Views
 
@@ -63,8 +64,12 @@ def check_address(host: str, port: int) -> int:
             ) from error
 
 
-def start_server(host: str, port: int) -> Any:
-    """A ``viser.ViserServer`` on exactly this port (0: any free one).
+def start_server(host: str, port: int, admission: Admission | None = None) -> Any:
+    """Return a ``viser.ViserServer`` on exactly this port (0: any free one).
+
+    Args:
+        host, port: to listen on.
+        admission: who may talk to it; None: as `Admission` has it for the host.
 
     Raises:
         InputError: as `check_address`.
@@ -72,8 +77,10 @@ def start_server(host: str, port: int) -> Any:
     port = check_address(host, port)
     import viser
 
-    with quiet_console():
+    admission = Admission(host) if admission is None else admission
+    with quiet_console(), admission.at_the_door():
         server = viser.ViserServer(host=host, port=port, label="gridreg", verbose=False)
+    admission.server = server._websock_server
     if server.get_port() != port:
         server.stop()
         raise InputError(f"viewer: port {port} was taken meanwhile; choose another port")

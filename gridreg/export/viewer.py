@@ -13,6 +13,7 @@ from typing import Any
 from PIL import Image
 from torch import Tensor
 
+from gridreg.export._admission import Admission
 from gridreg.export.browser import add_frustums, camera_of, picture_shape, quiet_console, start_server
 from gridreg.export.cameras import Camera, orbit_of_box, orbit_of_views
 from gridreg.export.model import Model
@@ -66,7 +67,8 @@ class Viewer:
         quiet: bool = False,
     ) -> None:
         self._preview = Preview(model)
-        self._server = start_server(host, port)
+        self._admission = Admission(host)
+        self._server = start_server(host, port, self._admission)
         self.host, self.port = host, int(self._server.get_port())
         self._refresh, self._updated = refresh, time.monotonic()
         self._news = threading.Condition()
@@ -82,13 +84,16 @@ class Viewer:
         self._thread = threading.Thread(target=self._run, name="gridreg-viewer", daemon=True)
         self._thread.start()
         if not quiet:
-            reach = "this machine only" if host in ("127.0.0.1", "localhost", "::1") else "the network"
+            reach = "this machine only" if self._admission.local else "the network, with this token"
             print(f"viewer: {self.url} (reached from {reach})", file=sys.stderr, flush=True)
 
     @property
     def url(self) -> str:
-        """Address of the page."""
-        return f"http://{'127.0.0.1' if self.host == '0.0.0.0' else self.host}:{self.port}"
+        """Address of the page, with its token where one is needed."""
+        name = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(self.host, self.host)
+        name = f"[{name}]" if ":" in name else name
+        query = f"/?token={self._admission.token}" if self._admission.needs_token else ""
+        return f"http://{name}:{self.port}{query}"
 
     @property
     def wants_update(self) -> bool:
@@ -182,7 +187,8 @@ class Viewer:
 
     def _wish(self, client: Any) -> None:
         with self._news:
-            self._wishes.append(client)
+            if client not in self._wishes:
+                self._wishes.append(client)
             self._news.notify_all()
 
     # --- drawing; in the viewer's thread
@@ -213,9 +219,10 @@ class Viewer:
     def _next(self) -> tuple[_Screen | None, float | None]:
         """The screen to draw now, else how long to wait for one to come to rest, seconds."""
         screens = list(self._screens.values())
-        for screen in screens:
-            if screen.drawn != screen.wanted:
-                return screen, None
+        waiting = [screen for screen in screens if screen.drawn != screen.wanted]
+        if waiting:
+            # Who has waited longest: one browser in motion must not keep the others still.
+            return min(waiting, key=lambda screen: screen.served), None
         now = time.monotonic()
         blurred = [(screen.moved + _REST - now, screen) for screen in screens if not screen.sharp]
         if not blurred:
@@ -225,6 +232,7 @@ class Viewer:
 
     def _draw(self, screen: _Screen) -> None:
         wanted, look = screen.wanted, self._panel.look
+        screen.served = time.monotonic()
         shape = picture_shape(screen.client, look.size)
         if screen.drawn != wanted:
             width = self._pace.moving(shape[1], shape[1] / shape[0])
@@ -273,7 +281,7 @@ class _Screen:
         self.client = client
         self.wanted, self.drawn = 1, 0
         self.width, self.sharp = 0, False
-        self.moved = 0.0
+        self.moved, self.served = 0.0, 0.0
 
 
 def _composed(rendered: Rendered, look: Look) -> tuple[ImageArray, str]:

@@ -10,6 +10,9 @@ from gridreg.export.pictures import MODES
 
 __all__ = ["Look", "Panel"]
 
+# Longer edge of an image, pixels.
+_SMALLEST, _LARGEST = 64, 1600
+
 
 @dataclass(frozen=True)
 class Look:
@@ -54,7 +57,12 @@ class Panel:
         self._status = server.gui.add_markdown("waiting for the first picture")
         self._mode = server.gui.add_dropdown("Show", MODES, initial_value=MODES[0])
         self._size = server.gui.add_slider(
-            "Resolution", min=64, max=1600, step=16, initial_value=size, hint="longer edge at rest, pixels"
+            "Resolution",
+            min=_SMALLEST,
+            max=_LARGEST,
+            step=16,
+            initial_value=size,
+            hint="longer edge at rest, pixels",
         )
         self._step: Any = None
         self._switches: dict[str, Any] = {}
@@ -93,7 +101,11 @@ class Panel:
         """What the controls say now."""
         step = int(self._step.value) if self._pinned and self._step is not None else None
         off = frozenset(name for name, switch in self._switches.items() if not switch.value)
-        return Look(str(self._mode.value), int(self._size.value), step, off)
+        # What a browser says may lie outside of what its controls offer.
+        mode = self._mode.value if self._mode.value in MODES else MODES[0]
+        if step is not None:
+            step = min(max(step, 0), int(self._step.max))
+        return Look(mode, min(max(int(self._size.value), _SMALLEST), _LARGEST), step, off)
 
     def reached(self, step: int) -> None:
         """Move the slider along with training, unless somebody holds it elsewhere."""
