@@ -104,3 +104,62 @@ class TestFiles:
         mesh = extract_mesh(AnalyticField(box((0.5, 0.4, 0.3))), resolution=17, colours=False)
         save_mesh(mesh, tmp_path / "a.ply")
         assert read_mesh(tmp_path / "a.ply").colours is None
+
+
+HEAD = (
+    "ply\nformat ascii 1.0\nelement vertex {vertices}\nproperty float x\nproperty float y\nproperty float z\n"
+    "element face {faces}\nproperty list uchar int vertex_indices\nend_header\n"
+)
+CORNERS = "0 0 0\n1 0 0\n0 1 0\n"
+
+
+class TestMalformedFiles:
+    """Each is refused in one line, quickly, and opens nothing but itself."""
+
+    def refused(self, path, message, capfd):
+        with pytest.raises(InputError, match=message) as error:
+            read_mesh(path)
+        assert "\n" not in str(error.value)
+        assert capfd.readouterr() == ("", "")
+
+    @pytest.mark.parametrize("corner", [9, 3, -1, -9])
+    def test_a_face_with_a_corner_that_is_not_there(self, tmp_path, capfd, corner):
+        path = tmp_path / "a.ply"
+        path.write_text(HEAD.format(vertices=3, faces=1) + CORNERS + f"3 0 1 {corner}\n")
+        self.refused(path, rf"found a face with corner {corner}, expected 0 to 2", capfd)
+
+    @pytest.mark.parametrize("name", ["a.zip", "a.tar.gz", "a.3mf", "a.txt", "a"])
+    def test_archives_and_what_is_no_mesh(self, tmp_path, capfd, name):
+        (tmp_path / name).write_bytes(b"PK\x03\x04" + bytes(100))
+        self.refused(tmp_path / name, "found suffix .*, expected a mesh: .ply, .obj", capfd)
+
+    @pytest.mark.parametrize("suffix", [".ply", ".obj", ".glb", ".stl", ".off", ".gltf"])
+    @pytest.mark.parametrize(
+        "content", [b"", b"\x00" * 200, b"solid x", b"glTF\x02\x00\x00\x00\xff\xff\xff\xff", b"{}"]
+    )
+    def test_noise(self, tmp_path, capfd, suffix, content):
+        path = tmp_path / f"a{suffix}"
+        path.write_bytes(content)
+        self.refused(path, r"cannot be read as a triangle mesh|found 0 faces", capfd)
+
+    def test_more_corners_than_the_file_holds(self, tmp_path, capfd):
+        path = tmp_path / "a.ply"
+        path.write_text(HEAD.format(vertices=10**12, faces=1) + CORNERS + "3 0 1 2\n")
+        self.refused(path, "cannot be read as a triangle mesh|found 0 faces", capfd)
+
+    def test_a_bad_normal_is_not_logged(self, tmp_path, caplog):
+        path = tmp_path / "a.stl"
+        loop = "outer loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\n"
+        path.write_text(f"solid x\nfacet normal x x x\n{loop}endfacet\nendsolid\n")
+        assert len(read_mesh(path).faces) == 1
+        assert caplog.records == []
+
+    def test_buffers_beside_it_are_not_opened(self, tmp_path, capfd):
+        (tmp_path / "secret.bin").write_bytes(bytes(36))
+        (tmp_path / "a.gltf").write_text(
+            '{"asset": {"version": "2.0"}, "buffers": [{"uri": "secret.bin", "byteLength": 36}],'
+            '"bufferViews": [{"buffer": 0, "byteLength": 36}], "accessors": [{"bufferView": 0, "componentType": 5126,'
+            '"count": 3, "type": "VEC3"}], "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],'
+            '"nodes": [{"mesh": 0}], "scenes": [{"nodes": [0]}], "scene": 0}'
+        )
+        self.refused(tmp_path / "a.gltf", "cannot be read as a triangle mesh", capfd)

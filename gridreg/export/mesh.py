@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import io
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,6 +28,9 @@ __all__ = ["MESH_SUFFIXES", "Mesh", "extract_mesh", "read_mesh", "save_mesh", "w
 
 MESH_SUFFIXES = (".ply", ".obj", ".glb")
 """Formats that `save_mesh` writes, by the suffix of the file's name."""
+
+READABLE = (*MESH_SUFFIXES, ".stl", ".off", ".gltf")
+"""Formats that `read_mesh` reads."""
 
 Colours = NDArray[np.uint8]
 
@@ -217,18 +224,24 @@ def write_mesh(
 
 
 def read_mesh(path: str | Path) -> Mesh:
-    """Read a triangle mesh in any format that trimesh reads; the parts of a scene become one mesh.
+    """Read a triangle mesh; the parts of a scene become one mesh. No other file, texture or archive is opened.
 
     Raises:
-        InputError: if there is no such file, it is not a mesh, or it holds no faces.
+        InputError: for another suffix than `READABLE`, or if there is no such file, it is not a mesh, it holds no
+            faces, or a face names a corner that is not there.
     """
     import trimesh
 
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such mesh file")
+    if path.suffix.lower() not in READABLE:
+        raise InputError(f"{path}: found suffix {path.suffix!r}, expected a mesh: {', '.join(READABLE)}")
     try:
-        loaded = trimesh.load_mesh(path, process=False)
+        # Bytes have no neighbours: materials, textures and buffers beside the file cannot be named.
+        content, kind = io.BytesIO(path.read_bytes()), path.suffix.lower()[1:]
+        with _quiet():
+            loaded = trimesh.load_mesh(content, file_type=kind, process=False, skip_materials=True)
         mesh = loaded.to_mesh() if isinstance(loaded, trimesh.Scene) else loaded
         vertices = np.asarray(mesh.vertices, dtype=np.float64)
         faces = np.asarray(mesh.faces, dtype=np.int64)
@@ -238,8 +251,24 @@ def read_mesh(path: str | Path) -> Mesh:
         raise InputError(f"{path}: cannot be read as a triangle mesh: {text}") from error
     if not len(faces) or not np.isfinite(vertices).all():
         raise InputError(f"{path}: found {len(faces)} faces, expected a triangle mesh with finite corners")
+    low, high = int(faces.min()), int(faces.max())
+    if low < 0 or high >= len(vertices):
+        wrong = low if low < 0 else high
+        raise InputError(f"{path}: found a face with corner {wrong}, expected 0 to {len(vertices) - 1}")
     colours = None
     visual: Any = mesh.visual
     if visual.kind == "vertex":
         colours = np.asarray(visual.vertex_colors, dtype=np.uint8)[:, :3]
     return Mesh(vertices, faces, colours)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep trimesh from logging tracebacks: what goes wrong is raised, or does not matter."""
+    logger = logging.getLogger("trimesh")
+    before = logger.level
+    logger.setLevel(logging.CRITICAL + 1)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
