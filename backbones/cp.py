@@ -12,10 +12,9 @@ from backbones.tensorial import TensorialField
 from gridreg import ops
 from gridreg.attach._hooks import open_channels
 from gridreg.attach.sites import Site, parameters
+from gridreg.ops.interpolation import LINE_AXES
 
-__all__ = ["LINE_AXES", "CPField"]
-
-LINE_AXES = (2, 1, 0)
+__all__ = ["CPField"]
 
 
 class CPField(TensorialField):

@@ -12,11 +12,9 @@ from backbones.tensorial import TensorialField
 from gridreg import ops
 from gridreg.attach._hooks import open_channels
 from gridreg.attach.sites import Site, parameters
+from gridreg.ops.interpolation import LINE_AXES, PLANE_AXES
 
-__all__ = ["LINE_AXES", "PLANE_AXES", "VMField"]
-
-PLANE_AXES = ((0, 1), (0, 2), (1, 2))
-LINE_AXES = (2, 1, 0)
+__all__ = ["VMField"]
 
 
 class VMField(TensorialField):

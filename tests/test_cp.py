@@ -7,10 +7,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import gridreg
-from backbones.cp import LINE_AXES, CPField
+from backbones.cp import CPField
 from gridreg import ops
 from gridreg.fields import make_field
 from gridreg.ops import use_backend
+from gridreg.ops.interpolation import LINE_AXES
 from gridreg.rendering import MarchSettings, OccupancyGrid, Rays, render_rays
 
 BOX = torch.tensor([[-1.0, -2.0, 0.0], [1.0, 1.0, 3.0]])

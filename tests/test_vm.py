@@ -7,7 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from backbones.tensorial import density_shift_for
-from backbones.vm import LINE_AXES, PLANE_AXES, VMField
+from backbones.vm import VMField
+from gridreg.ops.interpolation import LINE_AXES, PLANE_AXES
 
 BOX = torch.tensor([[-1.0, -2.0, 0.0], [1.0, 1.0, 3.0]])
 LETTERS = "xyz"

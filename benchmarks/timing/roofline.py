@@ -9,11 +9,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from backbones.vm import LINE_AXES, PLANE_AXES
 from gridreg.attach._hooks import open_channels
 from gridreg.errors import InputError
 from gridreg.ops.cpu import lookups
 from gridreg.ops.cpu.reductions import round_stochastically
+from gridreg.ops.interpolation import LINE_AXES, PLANE_AXES
 from gridreg.ops.linear import product_dtype
 
 from . import common, machine, step

@@ -19,6 +19,7 @@ from gridreg.errors import InputError
 from gridreg.export.marching import Faces, Vertices, drop_small_components, polygonise, vertex_normals
 from gridreg.export.volume import SeenDensity, sample_density, surface_threshold
 from gridreg.rendering import Field, OccupancyGrid
+from gridreg.segments import optical_depth_to_weights
 from gridreg.training.files import check_output_folder, writing
 
 if TYPE_CHECKING:
@@ -162,8 +163,8 @@ def _vertex_colours(
         inward = -torch.from_numpy(normals[part]).to(field.bounds)
         positions = x[:, None] + steps[:, None] * depth * inward[:, None]
         sigma = density(positions.reshape(-1, 3)).reshape(len(x), len(steps))
-        tau = sigma * (0.5 * depth)
-        weights = torch.exp(tau - tau.cumsum(dim=1)) * -torch.expm1(-tau)
+        offsets = torch.arange(len(x) + 1, device=x.device) * len(steps)
+        weights = optical_depth_to_weights((sigma * (0.5 * depth)).flatten(), offsets).view(sigma.shape)
         # Where nothing stops the ray (a corner of the box), the vertex itself decides.
         blank = weights.sum(dim=1) < 1e-6
         weights = weights / weights.sum(dim=1, keepdim=True).clamp(min=1e-6)
