@@ -29,7 +29,7 @@ from gridreg.ops.cpu.jit.compiler import (
 )
 from gridreg.ops.cpu.jit.launch import launch
 from gridreg.ops.cpu.jit.simd import LANES, add_to, load, one, prefetch, store, total, wide
-from gridreg.ops.cpu.jit.workspace import room
+from gridreg.ops.cpu.jit.workspace import workspace
 from tests.kernel_grids import threads
 
 
@@ -129,11 +129,11 @@ def test_refuses_strided_tensors():
 
 
 def test_work_space_is_kept_and_grows():
-    small = room("test", 10)
-    assert room("test", 2, 5).data_ptr() == small.data_ptr()
-    assert room("test", 10, dtype=torch.int32).dtype == torch.int32
-    assert room("test", 1000).shape == (1000,)
-    assert room("test", 3, 4).is_contiguous()
+    small = workspace("test", 10)
+    assert workspace("test", 2, 5).data_ptr() == small.data_ptr()
+    assert workspace("test", 10, dtype=torch.int32).dtype == torch.int32
+    assert workspace("test", 1000).shape == (1000,)
+    assert workspace("test", 3, 4).is_contiguous()
 
 
 def test_without_a_folder_for_the_cache(monkeypatch):

@@ -1,10 +1,11 @@
-"""Who may write where: samples sorted by the row of the grid that they touch.
+"""Counting sort of samples by grid row, so that each task owns its rows and gradients need no atomics.
 
-Adding gradients to a grid in parallel needs owners. Channels as owners split cache lines between threads; here a task
-owns whole rows. A counting sort lists the samples by the row below them, in sample order within a row. A task takes a
-range of rows with its share of the samples; samples between its first row and the row before it belong to two tasks,
-and each adds the half that falls on its own rows. Every row then receives its samples in an order that depends neither
-on the threads nor on the number of tasks; and as the samples of a row come together, its values are fetched once.
+Adding gradients to a grid in parallel needs owners (elsewhere a ``scatter_add`` with atomics). Channels as owners split
+cache lines between threads; here a task owns whole rows. A counting sort lists the samples by the row below them, in
+sample order within a row. A task takes a range of rows with its part of the samples; samples between its first row and
+the row before it belong to two tasks, and each adds the half that falls on its own rows. Every row then receives its
+samples in an order that depends neither on the threads nor on the number of tasks; and as the samples of a row come
+together, its values are fetched once.
 """
 
 from __future__ import annotations
@@ -14,24 +15,13 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from gridreg.ops.cpu.grid_coordinates import BATCH, PLACES, find, node
-from gridreg.ops.cpu.jit.compiler import (
-    float32,
-    inline,
-    int32,
-    int64,
-    integer,
-    kernel,
-    next_task,
-    scratch,
-    size,
-    vector,
-)
+from gridreg.ops.cpu.grid_coordinates import BATCH, COORDINATES, locate, node
+from gridreg.ops.cpu.jit.compiler import Vector, float32, inline, int32, int64, kernel, scratch
 from gridreg.ops.cpu.jit.launch import launch
 from gridreg.ops.cpu.jit.simd import load, one
-from gridreg.ops.cpu.jit.workspace import room
+from gridreg.ops.cpu.jit.workspace import workspace
 
-__all__ = ["ALONE", "ENTRY", "TASKS", "Listing", "felt", "list_by_row", "span"]
+__all__ = ["ALONE", "ENTRY", "TASKS", "Listing", "list_by_row", "nonzero_gradients", "span"]
 
 # Tasks for each axis or plane: more than threads, so that an unlucky thread does not hold the others up.
 TASKS = 16
@@ -47,16 +37,17 @@ class Listing(NamedTuple):
     Args:
         starts: ``(axes, rows + 1)`` int64; row r of axis k has the entries ``starts[k, r] : starts[k, r + 1]``.
         nodes: ``(axes, N, 4)`` int32; the node below along x, y and z, and the number of the sample.
-        shares: ``(axes, N, 4)`` float32; the share of the node above along x, y and z, and the upstream gradient.
+        fractions: ``(axes, N, 4)`` float32; the fraction of the way to the node above along x, y and z, and the
+            upstream gradient.
     """
 
     starts: Tensor
     nodes: Tensor
-    shares: Tensor
+    fractions: Tensor
 
 
 @inline
-def _count(rows: Any, base: Any, samples: Any, starts: Any, begin: Any, edge: Any) -> Any:
+def _count(rows: Any, base: int, samples: int, starts: Any, begin: int, edge: int) -> None:
     """Make entry r + 1 the place where row r begins."""
     for row in range(begin, begin + edge + 1):
         starts[row] = 0
@@ -70,45 +61,37 @@ def _count(rows: Any, base: Any, samples: Any, starts: Any, begin: Any, edge: An
 
 
 @kernel
-def _sort(table: Any) -> None:
-    """u, upstream, whether it is one number for a sample, shape, starts, nodes, shares, rows; a task is an axis."""
-    u, upstream = vector(table, 0, float32), vector(table, 1, float32)
-    summed = integer(table, 2) != 0
-    edges = vector(table, 3, int64)
-    starts, rows = vector(table, 4, int64), vector(table, 7, int32)
-    to_nodes, to_shares = vector(table, 5, int32), vector(table, 6, float32)
-    samples, stride = size(table, 0, 0), size(table, 4, 1)
-    shape = edges[0], edges[1], edges[2]
-    nodes, shares = scratch(PLACES, int32), scratch(PLACES, float32)
-    places = nodes, shares
-    while True:
-        axis = next_task(table)
-        if axis < 0:
-            break
-        edge, begin, base = edges[axis], axis * stride, axis * samples
-        for n in range(samples):
-            rows[base + n] = node(load(u, 3 * n + axis, one()), edge)[0]
-        _count(rows, base, samples, starts, begin, edge)
-        for first in range(0, samples, BATCH):
-            count = min(int64(BATCH), samples - first)
-            find(places, u, first, count, shape)
-            for q in range(count):
-                row = begin + rows[base + first + q] + 1
-                to = ENTRY * (base + starts[row])
-                # Where the row begins moves to where it ends while its samples are listed.
-                starts[row] += 1
-                to_nodes[to] = nodes[q]
-                to_nodes[to + 1] = nodes[BATCH + q]
-                to_nodes[to + 2] = nodes[2 * BATCH + q]
-                to_nodes[to + 3] = first + q
-                to_shares[to] = shares[q]
-                to_shares[to + 1] = shares[BATCH + q]
-                to_shares[to + 2] = shares[2 * BATCH + q]
-                to_shares[to + 3] = upstream[first + q] if summed else float32(1)
+def _sort(
+    axis: int, u: Vector[float32], upstream: Vector[float32], summed: int64, edges: Vector[int64], stride: int64,
+    starts: Vector[int64], nodes: Vector[int32], fractions: Vector[float32], rows: Vector[int32],
+) -> None:  # fmt: skip
+    """Sort along one axis; ``summed``: upstream is one number a sample; ``stride``: of an axis in ``starts``."""
+    samples, shape = u.shape[0] // 3, (edges[0], edges[1], edges[2])
+    found, between = scratch(COORDINATES, int32), scratch(COORDINATES, float32)
+    edge, begin, base = edges[axis], axis * stride, axis * samples
+    for n in range(samples):
+        rows[base + n] = node(load(u, 3 * n + axis, one()), edge)[0]
+    _count(rows, base, samples, starts, begin, edge)
+    for first in range(0, samples, BATCH):
+        count = min(int64(BATCH), samples - first)
+        locate(found, between, u, first, count, shape)
+        for q in range(count):
+            row = begin + rows[base + first + q] + 1
+            to = ENTRY * (base + starts[row])
+            # Where the row begins moves to where it ends while its samples are listed.
+            starts[row] += 1
+            nodes[to] = found[q]
+            nodes[to + 1] = found[BATCH + q]
+            nodes[to + 2] = found[2 * BATCH + q]
+            nodes[to + 3] = first + q
+            fractions[to] = between[q]
+            fractions[to + 1] = between[BATCH + q]
+            fractions[to + 2] = between[2 * BATCH + q]
+            fractions[to + 3] = upstream[first + q] if summed != 0 else float32(1)
 
 
-def felt(u: Tensor, upstream: Tensor) -> tuple[Tensor, Tensor]:
-    """Samples whose gradient is not 0, if there is one number for each: what most rays see is hardly anything.
+def nonzero_gradients(u: Tensor, upstream: Tensor) -> tuple[Tensor, Tensor]:
+    """Samples whose gradient is not 0, if there is one number for each: most of what rays see is next to nothing.
 
     Args:
         u: ``(N, 3)``.
@@ -129,20 +112,20 @@ def list_by_row(u: Tensor, upstream: Tensor, shape: tuple[int, int, int], sorts:
         shape: nodes along x, y and z.
         sorts: number of axes.
     """
-    samples = u.shape[0]
+    samples, stride = u.shape[0], max(shape[:sorts]) + 1
     listing = Listing(
-        room("starts", sorts, max(shape[:sorts]) + 1, dtype=torch.int64),
-        room("nodes", sorts, samples, ENTRY, dtype=torch.int32),
-        room("shares", sorts, samples, ENTRY),
+        workspace("starts", sorts, stride, dtype=torch.int64),
+        workspace("nodes", sorts, samples, ENTRY, dtype=torch.int32),
+        workspace("fractions", sorts, samples, ENTRY),
     )
-    rows = room("rows", sorts, samples, dtype=torch.int32)
-    summed = int(upstream.dim() == 1)
-    launch(_sort, sorts, u, upstream, summed, torch.tensor(shape), *listing, rows, alone=samples < ALONE)
+    rows = workspace("rows", sorts, samples, dtype=torch.int32)
+    summed, alone = int(upstream.dim() == 1), samples < ALONE
+    launch(_sort, sorts, u, upstream, summed, torch.tensor(shape), stride, *listing, rows, alone=alone)
     return listing
 
 
 @inline
-def span(starts: Any, begin: Any, edge: Any, part: Any, where: Any) -> Any:
+def span(starts: Any, begin: int, edge: int, part: int, third: int) -> tuple[int, int]:
     """Entries of a third of the samples that task ``part`` of `TASKS` sees.
 
     Thirds: 0 for those just below its first row, of which the task owns the node above; 1 for those between two of its
@@ -150,8 +133,8 @@ def span(starts: Any, begin: Any, edge: Any, part: Any, where: Any) -> Any:
     ``starts``, ``edge`` its nodes.
     """
     first, last = _row_at(starts, begin, edge, part), _row_at(starts, begin, edge, part + 1)
-    low = max(first - 1, 0) if where == 0 else (first if where == 1 else last - 1)
-    high = first if where == 0 else (last - 1 if where == 1 else last)
+    low = max(first - 1, 0) if third == 0 else (first if third == 1 else last - 1)
+    high = first if third == 0 else (last - 1 if third == 1 else last)
     # The last node is below no sample.
     high = min(high, edge - 1)
     if last <= first or high <= low:
@@ -160,7 +143,7 @@ def span(starts: Any, begin: Any, edge: Any, part: Any, where: Any) -> Any:
 
 
 @inline
-def _row_at(starts: Any, begin: Any, edge: Any, part: Any) -> Any:
+def _row_at(starts: Any, begin: int, edge: int, part: int) -> Any:
     """First row of a task, so that all have about the same number of samples."""
     if part == TASKS:
         return edge

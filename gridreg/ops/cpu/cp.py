@@ -6,209 +6,187 @@ A gradient task owns nodes of one line, and computes the product of the other tw
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from gridreg.ops.cpu.counting_sort import ALONE, ENTRY, TASKS, felt, list_by_row, span
-from gridreg.ops.cpu.grid_coordinates import BATCH, PLACES, batch, find
-from gridreg.ops.cpu.interpolation import ahead, linear, prefetch_row
+from gridreg.ops.cpu.counting_sort import ALONE, ENTRY, TASKS, list_by_row, nonzero_gradients, span
+from gridreg.ops.cpu.grid_coordinates import BATCH, COORDINATES, batch, locate
+from gridreg.ops.cpu.interpolation import Segment, linear, lookahead, prefetch_row
 from gridreg.ops.cpu.jit.compiler import (
     Kernel,
+    Matrix,
+    Vector,
     float32,
     inline,
     int32,
     int64,
-    integer,
     kernel,
-    next_task,
     scratch,
-    size,
-    vector,
 )
 from gridreg.ops.cpu.jit.launch import launch
 from gridreg.ops.cpu.jit.simd import LANES, load, one, store, total, wide
-from gridreg.ops.cpu.jit.workspace import room
+from gridreg.ops.cpu.jit.workspace import workspace
 
-__all__ = ["density", "density_backward", "features", "features_backward", "product_sum"]
-
-
-@inline
-def _product(lines: Any, at: Any, shares: Any, channels: Any, c: Any, like: Any) -> Any:
-    value = linear(lines[0], at[0] + c, channels, shares[0], like)
-    value = value * linear(lines[1], at[1] + c, channels, shares[1], like)
-    return value * linear(lines[2], at[2] + c, channels, shares[2], like)
+__all__ = ["density", "density_backward", "features", "features_backward", "product_sum", "segments_of"]
 
 
 @inline
-def product_sum(lines: Any, at: Any, shares: Any, channels: Any, read: Any) -> Any:
-    """Sum over channels of the product of three lines whose channels begin at elements ``at``."""
+def segments_of(nodes: Any, fractions: Any, q: int, channels: int) -> Any:
+    """Segments of sample ``q`` of a batch on the lines along x, y and z."""
+    return (
+        Segment(int64(nodes[q]) * channels, channels, fractions[q]),
+        Segment(int64(nodes[BATCH + q]) * channels, channels, fractions[BATCH + q]),
+        Segment(int64(nodes[2 * BATCH + q]) * channels, channels, fractions[2 * BATCH + q]),
+    )
+
+
+@inline
+def _product(lines: Any, segments: Any, c: int, dtype_like: Any) -> Any:
+    value = linear(lines[0], segments[0], c, dtype_like)
+    value = value * linear(lines[1], segments[1], c, dtype_like)
+    return value * linear(lines[2], segments[2], c, dtype_like)
+
+
+@inline
+def product_sum(lines: Any, segments: Any, read: int) -> Any:
+    """Sum over channels of the product of three lines."""
     blocks = read - read % LANES
     lanes = wide()
     for c in range(0, blocks, LANES):
-        lanes = lanes + _product(lines, at, shares, channels, c, wide())
+        lanes = lanes + _product(lines, segments, c, wide())
     value = total(lanes)
     for c in range(blocks, read):
-        value += _product(lines, at, shares, channels, c, one())
+        value += _product(lines, segments, c, one())
     return value
 
 
 @inline
-def _write(lines: Any, at: Any, shares: Any, channels: Any, read: Any, out: Any, to: Any) -> Any:
+def _write(lines: Any, segments: Any, read: int, out: Any, to: int) -> None:
     blocks = read - read % LANES
     for c in range(0, blocks, LANES):
-        store(out, to + c, _product(lines, at, shares, channels, c, wide()))
+        store(out, to + c, _product(lines, segments, c, wide()))
     for c in range(blocks, read):
-        store(out, to + c, _product(lines, at, shares, channels, c, one()))
-    for c in range(read, channels):
+        store(out, to + c, _product(lines, segments, c, one()))
+    for c in range(read, segments[0].across):
         out[to + c] = float32(0)
 
 
 @inline
-def _forward(table: Any, summed: Any) -> Any:
-    u, read, out = vector(table, 0, float32), integer(table, 4), vector(table, 5, float32)
-    # Along x, y and z: line k lies along axis 2 - k.
-    lines = vector(table, 3, float32), vector(table, 2, float32), vector(table, 1, float32)
-    shape = size(table, 3, 0), size(table, 2, 0), size(table, 1, 0)
-    samples, channels = size(table, 0, 0), size(table, 1, 1)
-    nodes, shares = scratch(PLACES, int32), scratch(PLACES, float32)
-    places = nodes, shares
-    while True:
-        task = next_task(table)
-        if task < 0:
-            break
-        first, last = batch(task, samples)
-        find(places, u, first, last - first, shape)
-        for q in range(last - first):
-            x, y, z = int64(nodes[q]), int64(nodes[BATCH + q]), int64(nodes[2 * BATCH + q])
-            at = x * channels, y * channels, z * channels
-            between = shares[q], shares[BATCH + q], shares[2 * BATCH + q]
-            if summed:
-                out[first + q] = product_sum(lines, at, between, channels, read)
-            else:
-                _write(lines, at, between, channels, read, out, (first + q) * channels)
+def _forward(
+    task: int, u: Any, lines: Any, read: int, nodes: Any, fractions: Any, out: Any, summed: bool
+) -> None:
+    """Write the samples of a task; ``lines`` along x, y and z."""
+    first, last = batch(task, u.shape[0])
+    channels, shape = lines[0].shape[1], (lines[0].shape[0], lines[1].shape[0], lines[2].shape[0])
+    locate(nodes, fractions, u, first, last - first, shape)
+    for q in range(last - first):
+        segments = segments_of(nodes, fractions, q, channels)
+        if summed:
+            out[first + q] = product_sum(lines, segments, read)
+        else:
+            _write(lines, segments, read, out, (first + q) * channels)
 
 
 @kernel
-def _density(table: Any) -> None:
-    """u, three lines, channels to read, out."""
-    _forward(table, True)
+def _density(
+    task: int, u: Matrix[float32], z: Matrix[float32], y: Matrix[float32], x: Matrix[float32], read: int64,
+    out: Vector[float32],
+) -> None:  # fmt: skip
+    """Sum over channels of the product of the lines."""
+    nodes, fractions = scratch(COORDINATES, int32), scratch(COORDINATES, float32)
+    _forward(task, u, (x, y, z), read, nodes, fractions, out, True)
 
 
 @kernel
-def _features(table: Any) -> None:
-    """u, three lines, channels to read, out."""
-    _forward(table, False)
+def _features(
+    task: int, u: Matrix[float32], z: Matrix[float32], y: Matrix[float32], x: Matrix[float32], read: int64,
+    out: Vector[float32],
+) -> None:  # fmt: skip
+    """Product of the lines, channel by channel."""
+    nodes, fractions = scratch(COORDINATES, int32), scratch(COORDINATES, float32)
+    _forward(task, u, (x, y, z), read, nodes, fractions, out, False)
+
+
+class _Target(NamedTuple):
+    """Where a gradient is added for the node below a sample and the node above: arrays, and first elements."""
+
+    lower: Any
+    lower_first: Any
+    upper: Any
+    upper_first: Any
 
 
 @inline
-def _add(
-    lines: Any,
-    at: Any,
-    shares: Any,
-    g: Any,
-    share: Any,
-    to: Any,
-    i: Any,
-    j: Any,
-    channels: Any,
-    c: Any,
-    like: Any,
-) -> Any:
-    """Add the gradient of some channels of a sample to the node below and the node above."""
-    value = linear(lines[0], at[0] + c, channels, shares[0], like) * g
-    value = value * linear(lines[1], at[1] + c, channels, shares[1], like)
-    below = load(to[0], i + c, like) + value * (float32(1) - share)
-    above = load(to[1], j + c, like) + value * share
-    store(to[0], i + c, below)
-    store(to[1], j + c, above)
+def _add(others: Any, segments: Any, fraction: Any, c: int, g: Any, to: Any, dtype_like: Any) -> None:
+    """Add the gradient of channels from ``c`` on of a sample to two nodes; ``others`` are the other two lines."""
+    value = linear(others[0], segments[0], c, dtype_like) * g
+    value = value * linear(others[1], segments[1], c, dtype_like)
+    i, j = to.lower_first + c, to.upper_first + c
+    below = load(to.lower, i, dtype_like) + value * (float32(1) - fraction)
+    above = load(to.upper, j, dtype_like) + value * fraction
+    store(to.lower, i, below)
+    store(to.upper, j, above)
 
 
 @inline
-def _serve(
-    lines: Any,
-    others: Any,
-    axis: Any,
-    to: Any,
-    keep: Any,
-    base: Any,
-    listing: Any,
-    entries: Any,
-    channels: Any,
-    read: Any,
-    upstream: Any,
-    summed: Any,
-) -> Any:
-    """Add the gradients of a range of entries; what is not kept goes to the first elements after its base."""
-    nodes, shares = listing
-    blocks = read - read % LANES
-    far = ENTRY * ahead(read)
-    for e in range(entries[0], entries[1], ENTRY):
-        if not summed:
-            then = min(e + far, entries[1] - ENTRY)
-            prefetch_row(upstream, int64(nodes[then + 3]) * channels, read)
-        at = int64(nodes[e + others[0]]) * channels, int64(nodes[e + others[1]]) * channels
-        between = shares[e + others[0]], shares[e + others[1]]
-        below, share, g = int64(nodes[e + axis]) * channels, shares[e + axis], shares[e + 3]
-        i, j = base[0] + (below & keep[0]), base[1] + ((below + channels) & keep[1])
-        n = int64(nodes[e + 3]) * channels
-        for c in range(0, blocks, LANES):
-            gc = wide() + g if summed else load(upstream, n + c, wide())
-            _add(lines, at, between, gc, share, to, i, j, channels, c, wide())
-        for c in range(blocks, read):
-            gc = g if summed else load(upstream, n + c, one())
-            _add(lines, at, between, gc, share, to, i, j, channels, c, one())
-
-
-@inline
-def _backward(table: Any, summed: Any) -> Any:
-    read, upstream = integer(table, 4), vector(table, 5, float32)
-    starts, nodes, shares = vector(table, 9, int64), vector(table, 10, int32), vector(table, 11, float32)
-    channels, samples, stride = size(table, 1, 1), size(table, 0, 0), size(table, 9, 1)
-    waste = vector(table, 12, float32)
-    while True:
-        task = next_task(table)
-        if task < 0:
-            break
-        axis, part = task // TASKS, task % TASKS
-        others = 1 if axis == 0 else 0, 1 if axis == 2 else 2
-        lines = vector(table, 3 - others[0], float32), vector(table, 3 - others[1], float32)
-        own = vector(table, 8 - axis, float32)
-        for where in range(3):
-            first, last = span(starts, axis * stride, size(table, 3 - axis, 0), part, where)
-            # What falls on nodes of another task, which sees these samples too, goes to waste.
-            low, high = where != 0, where != 2
-            to = own if low else waste, own if high else waste
-            keep = int64(-1 if low else 0), int64(-1 if high else 0)
-            base = int64(0 if low else task * channels), int64(0 if high else task * channels)
-            entries = ENTRY * (axis * samples + first), ENTRY * (axis * samples + last)
-            _serve(
-                lines,
-                others,
-                axis,
-                to,
-                keep,
-                base,
-                (nodes, shares),
-                entries,
-                channels,
-                read,
-                upstream,
-                summed,
+def _backward(
+    task: int, lines: Any, read: int, gradients: Any, waste: Any, listing: Any, upstream: Any, summed: bool
+) -> None:
+    """Add the gradients that one task owns; ``lines`` and ``gradients`` along x, y and z."""
+    axis, part = task // TASKS, task % TASKS
+    b, c_ = 1 if axis == 0 else 0, 1 if axis == 2 else 2
+    others, own, (starts, nodes, fractions) = (lines[b], lines[c_]), gradients[axis], listing
+    samples, stride = nodes.shape[0] // (3 * ENTRY), starts.shape[0] // 3
+    channels, far, blocks = lines[0].shape[1], ENTRY * lookahead(read), read - read % LANES
+    for third in range(3):
+        first, last = span(starts, axis * stride, lines[axis].shape[0], part, third)
+        # What falls on nodes of another task, which sees these samples too, goes to where nobody reads.
+        lower, upper = third != 0, third != 2
+        to_lower, to_upper = own if lower else waste, own if upper else waste
+        last = ENTRY * (axis * samples + last)
+        for e in range(ENTRY * (axis * samples + first), last, ENTRY):
+            if not summed:
+                prefetch_row(upstream, int64(nodes[min(e + far, last - ENTRY) + 3]) * channels, read)
+            segments = (
+                Segment(int64(nodes[e + b]) * channels, channels, fractions[e + b]),
+                Segment(int64(nodes[e + c_]) * channels, channels, fractions[e + c_]),
             )
+            below, fraction, g = int64(nodes[e + axis]) * channels, fractions[e + axis], fractions[e + 3]
+            to = _Target(
+                to_lower,
+                below if lower else task * channels,
+                to_upper,
+                below + channels if upper else task * channels,
+            )
+            n = int64(nodes[e + 3]) * channels
+            for c in range(0, blocks, LANES):
+                gc = wide() + g if summed else load(upstream, n + c, wide())
+                _add(others, segments, fraction, c, gc, to, wide())
+            for c in range(blocks, read):
+                gc = g if summed else load(upstream, n + c, one())
+                _add(others, segments, fraction, c, gc, to, one())
 
 
 @kernel
-def _density_backward(table: Any) -> None:
-    """u, three lines, channels to read, upstream, three line gradients, listing, waste."""
-    _backward(table, True)
+def _density_backward(
+    task: int, z: Matrix[float32], y: Matrix[float32], x: Matrix[float32], read: int64, to_z: Vector[float32],
+    to_y: Vector[float32], to_x: Vector[float32], waste: Vector[float32], starts: Vector[int64],
+    nodes: Vector[int32], fractions: Vector[float32], upstream: Vector[float32],
+) -> None:  # fmt: skip
+    """Gradients of the lines from one number a sample."""
+    _backward(task, (x, y, z), read, (to_x, to_y, to_z), waste, (starts, nodes, fractions), upstream, True)
 
 
 @kernel
-def _features_backward(table: Any) -> None:
-    """Arguments as of `_density_backward`."""
-    _backward(table, False)
+def _features_backward(
+    task: int, z: Matrix[float32], y: Matrix[float32], x: Matrix[float32], read: int64, to_z: Vector[float32],
+    to_y: Vector[float32], to_x: Vector[float32], waste: Vector[float32], starts: Vector[int64],
+    nodes: Vector[int32], fractions: Vector[float32], upstream: Vector[float32],
+) -> None:  # fmt: skip
+    """Gradients of the lines from one number a channel."""
+    _backward(task, (x, y, z), read, (to_x, to_y, to_z), waste, (starts, nodes, fractions), upstream, False)
 
 
 def density(u: Tensor, lines: Sequence[Tensor], read: int) -> Tensor:
@@ -228,13 +206,11 @@ def features(u: Tensor, lines: Sequence[Tensor], read: int) -> Tensor:
 def _gradients(
     compiled: Kernel, u: Tensor, lines: Sequence[Tensor], read: int, upstream: Tensor
 ) -> list[Tensor]:
-    u, upstream = felt(u, upstream)
+    u, upstream = nonzero_gradients(u, upstream)
     listing = list_by_row(u, upstream, (lines[2].shape[0], lines[1].shape[0], lines[0].shape[0]), 3)
     gradients = [torch.zeros_like(line) for line in lines]
-    waste = room("waste", 3 * TASKS, lines[0].shape[1]).zero_()
-    launch(
-        compiled, 3 * TASKS, u, *lines, read, upstream, *gradients, *listing, waste, alone=u.shape[0] < ALONE
-    )
+    waste, alone = workspace("waste", 3 * TASKS, lines[0].shape[1]).zero_(), u.shape[0] < ALONE
+    launch(compiled, 3 * TASKS, *lines, read, *gradients, waste, *listing, upstream, alone=alone)
     return gradients
 
 

@@ -1,38 +1,38 @@
-"""Where the samples of a batch lie on a grid, for kernels."""
+"""The grid coordinates of a batch of samples, for kernels."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from gridreg.ops.cpu.jit.compiler import exact, float32, inline, int32
+from gridreg.ops.cpu.jit.compiler import Vector, exact, float32, inline, int32, int64
 from gridreg.ops.cpu.jit.simd import load, one
 
-__all__ = ["BATCH", "PLACES", "axes", "batch", "find", "node"]
+__all__ = ["BATCH", "COORDINATES", "axes", "batch", "locate", "node"]
 
-# Samples of a batch: their places fit into the first-level cache.
+# Samples of a batch: their coordinates fit into the first-level cache.
 BATCH = 256
 # One number for each axis of each of them.
-PLACES = 3 * BATCH
+COORDINATES = 3 * BATCH
 
 
 @inline
-def batch(task: Any, count: Any) -> Any:
+def batch(task: int, count: int) -> tuple[int, int]:
     """First and last (exclusive) of the samples of a task."""
     return task * BATCH, min(count, (task + 1) * BATCH)
 
 
 @inline
-def axes(k: Any) -> Any:
+def axes(k: int) -> tuple[int, int, int]:
     """The two axes of plane ``k``, and the axis of line ``k``."""
     return 1 if k == 2 else 0, 1 if k == 0 else 2, 2 - k
 
 
 # Every operation rounded on its own, as in the plain version: on 300 nodes the last bit of a product is 3e-5 of a cell.
 @exact
-def node(u: Any, edge: Any) -> Any:
-    """Node below coordinate ``u``, clamped to [0, 1], on ``edge`` nodes, and the share of the node above it.
+def node(u: Any, edge: int) -> tuple[Any, Any]:
+    """Node below coordinate ``u``, clamped to [0, 1], on ``edge`` nodes, and the fraction of the way to the next one.
 
-    Not-a-number gives node 0 and a share that is not a number: nothing is read out of bounds, nothing is hidden.
+    Not-a-number gives node 0 and a fraction that is not a number: nothing is read out of bounds, nothing is hidden.
     """
     u = float32(0) if u < float32(0) else u
     u = float32(1) if u > float32(1) else u
@@ -42,15 +42,17 @@ def node(u: Any, edge: Any) -> Any:
 
 
 @inline
-def find(places: Any, u: Any, first: Any, count: Any, shape: Any) -> Any:
-    """Find ``count`` samples from ``first`` on, on a grid of ``shape`` nodes.
+def locate(
+    nodes: Vector[int32], fractions: Vector[float32], u: Vector[float32], first: int, count: int,
+    shape: tuple[int, int, int],
+) -> None:  # fmt: skip
+    """Write node below and fraction along each of the three axes for ``count`` samples from ``first`` on.
 
-    ``places`` are two arrays of `PLACES`: node below along each of the three axes, and share of the node above.
+    ``nodes`` and ``fractions`` have `COORDINATES` elements, those of axis a from ``a * BATCH`` on.
     """
-    nodes, shares = places
     for axis in range(3):
-        edge = shape[axis]
+        edge = int64(shape[axis])
         for q in range(count):
-            lower, share = node(load(u, 3 * (first + q) + axis, one()), edge)
+            lower, fraction = node(load(u, 3 * (first + q) + axis, one()), edge)
             nodes[axis * BATCH + q] = lower
-            shares[axis * BATCH + q] = share
+            fractions[axis * BATCH + q] = fraction

@@ -1,62 +1,104 @@
 """Interpolation in channels-last grids, for kernels.
 
-Grids are flat arrays. The processor is asked for the rows of samples ahead while those at hand are computed: along rays
-they are too far apart for it to guess.
+Elements of a grid are counted in the order of memory. The processor is asked for the nodes of later samples while those
+at hand are computed: along rays they are too far apart for it to guess.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 from gridreg.ops.cpu.jit.compiler import float32, inline
 from gridreg.ops.cpu.jit.simd import load, prefetch
 
-__all__ = ["ahead", "bilinear", "corners", "linear", "prefetch_cell", "prefetch_row"]
+__all__ = [
+    "Cell",
+    "Segment",
+    "bilinear",
+    "cell_weights",
+    "linear",
+    "lookahead",
+    "prefetch_cell",
+    "prefetch_row",
+]
 
-# How far ahead rows are asked for, in channels. Measured: with few channels memory needs some samples of time, with
+# How far ahead nodes are asked for, in channels. Measured: with few channels memory needs some samples of time, with
 # many more requests than the processor keeps open push each other out.
 _AHEAD = 96
 # Elements of a cache line.
 _LINE = 16
 
 
+class Cell(NamedTuple):
+    """The four nodes of a plane around a sample.
+
+    Args:
+        first: element at which the channels of the lowest node begin.
+        across, down: elements from there to the next node along the second and the first axis.
+        weights: interpolation weights of the nodes (0, 0), (0, 1), (1, 0), (1, 1).
+    """
+
+    first: Any
+    across: Any
+    down: Any
+    weights: Any
+
+
+class Segment(NamedTuple):
+    """The two nodes of a line around a sample.
+
+    Args:
+        first: element at which the channels of the lower node begin.
+        across: elements from there to the upper node.
+        fraction: interpolation weight of the upper node.
+    """
+
+    first: Any
+    across: Any
+    fraction: Any
+
+
 @inline
-def ahead(read: Any) -> Any:
-    """How many samples ahead to ask for rows of ``read`` channels."""
+def lookahead(read: int) -> int:
+    """How many samples ahead to ask for nodes of ``read`` channels."""
     return max(_AHEAD // max(read, 1), 1)
 
 
 @inline
-def prefetch_row(grid: Any, i: Any, length: Any) -> Any:
+def prefetch_row(grid: Any, i: int, length: int) -> None:
     """Ask for ``length`` elements from ``i`` on."""
     for c in range(i, i + length, _LINE):
         prefetch(grid, c)
 
 
 @inline
-def prefetch_cell(plane: Any, i: Any, channels: Any, down: Any, read: Any) -> Any:
+def prefetch_cell(plane: Any, first: int, across: int, down: int, read: int) -> None:
     """Ask for the first ``read`` channels of the four nodes of a cell of a plane."""
-    prefetch_row(plane, i, channels + read)
-    prefetch_row(plane, i + down, channels + read)
+    prefetch_row(plane, first, across + read)
+    prefetch_row(plane, first + down, across + read)
 
 
 @inline
-def corners(a: Any, b: Any) -> Any:
-    """Weights of the four nodes around a position in a cell of a plane: (0, 0), (0, 1), (1, 0), (1, 1)."""
+def cell_weights(a: Any, b: Any) -> tuple[Any, Any, Any, Any]:
+    """Interpolation weights of a cell's nodes, from the fractions along both axes."""
     rest_a, rest_b = float32(1) - a, float32(1) - b
     return rest_a * rest_b, rest_a * b, a * rest_b, a * b
 
 
 @inline
-def bilinear(plane: Any, i: Any, across: Any, down: Any, w: Any, like: Any) -> Any:
-    """Channels of a plane; those of the cell's first node begin at ``i``, those of the nodes along each axis
-    ``across`` and ``down`` elements further."""
-    below = load(plane, i, like) * w[0] + load(plane, i + across, like) * w[1]
-    i += down
-    return below + load(plane, i, like) * w[2] + load(plane, i + across, like) * w[3]
+def bilinear(plane: Any, cell: Any, c: int, dtype_like: Any) -> Any:
+    """Value of channels from ``c`` on of a plane in a `Cell`."""
+    i, w = cell.first + c, cell.weights
+    below = load(plane, i, dtype_like) * w[0] + load(plane, i + cell.across, dtype_like) * w[1]
+    i += cell.down
+    return below + load(plane, i, dtype_like) * w[2] + load(plane, i + cell.across, dtype_like) * w[3]
 
 
 @inline
-def linear(line: Any, i: Any, across: Any, share: Any, like: Any) -> Any:
-    """Channels of a line; those of the node below begin at ``i``, those of the node above ``across`` further."""
-    return load(line, i, like) * (float32(1) - share) + load(line, i + across, like) * share
+def linear(line: Any, segment: Any, c: int, dtype_like: Any) -> Any:
+    """Value of channels from ``c`` on of a line in a `Segment`."""
+    i, fraction = segment.first + c, segment.fraction
+    return (
+        load(line, i, dtype_like) * (float32(1) - fraction)
+        + load(line, i + segment.across, dtype_like) * fraction
+    )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -13,7 +14,7 @@ from gridreg.ops import vm as vm_ops
 from gridreg.ops.cpu import cp, vm, vm_gradient
 from gridreg.ops.cpu.jit.simd import LANES
 from gridreg.ops.cpu.march import mark
-from gridreg.ops.cpu.march_density import walk
+from gridreg.ops.cpu.march_density import march_density
 from gridreg.ops.cpu.reductions import round_stochastically
 from gridreg.ops.gradient_buffers import gradient_buffers, rounding_fraction
 from gridreg.ops.interpolation import suits_cpu
@@ -109,17 +110,19 @@ def _march_density(
     """March without planes through a CP grid, else through a VM grid."""
     lines, read = _opened(lines, open_channels)
     grids = (*planes, *lines)
-    found = walk(
+    parts = _parts(grids)
+    found, u = march_density(
         mark(march),
-        *_parts(grids),
+        parts[0] if planes else (),
+        parts[-1],
         read=read,
         activation=activation,
         step=march.step,
         transmittance_bound=transmittance_bound,
     )
     backward = vm_gradient.density_backward if planes else cp.density_backward
-    density: Tensor = _Activated.apply(backward, found.density, found.u, activation.scale, read, *grids)  # type: ignore[no-untyped-call]
-    return RayMarchResult(found.offsets, found.index, found.t, found.positions, density)
+    density: Tensor = _Activated.apply(backward, found.density, u, activation.scale, read, *grids)  # type: ignore[no-untyped-call]
+    return found._replace(density=density)
 
 
 @vm_ops.vm_march_density.register_cpu()
@@ -173,8 +176,9 @@ def _vm_features(
     open_channels: int | None = None,
     dtype: torch.dtype = torch.float32,
 ) -> Tensor:
-    forward = vm.low_features if dtype == torch.bfloat16 else vm.features
-    return _lookup(forward, vm_gradient.features_backward, u, planes, lines, open_channels)
+    return _lookup(
+        partial(vm.features, dtype=dtype), vm_gradient.features_backward, u, planes, lines, open_channels
+    )
 
 
 @cp_ops.cp_density.register_cpu(suits=suits_cpu)

@@ -17,15 +17,16 @@ from gridreg.ops.cpu.jit.compiler import (
     Vector,
     exact,
     float32,
+    inline,
     int64,
     kernel,
     uint8,
 )
 from gridreg.ops.cpu.jit.launch import launch
-from gridreg.ops.cpu.march_bits import MarchBits, distance_of, next_bit, sample_at
 
-__all__ = ["mark", "march"]
+__all__ = ["MarchBits", "distance_of", "mark", "march", "next_bit", "sample_at"]
 
+_REST = np.int64(2**63 - 1)
 # Edge, in cells, of the blocks that are skipped whole when nothing in them is occupied.
 _COARSE = np.uint32(4)
 _TOLERANCE = np.float32(ops.CELL_TOLERANCE)
@@ -37,6 +38,58 @@ _INFINITE = np.float32(np.inf)
 # Rays of one task.
 _RAYS = 32
 _kept = threading.local()
+
+
+class MarchBits(NamedTuple):
+    """The samples of a march before they are written out.
+
+    Args:
+        origins, directions: ``(R, 3)``, contiguous.
+        near, shift: ``(R,)``; sample ``index`` lies at ``near + (index + shift) * step``.
+        bits: ``(R, words)`` int64; bit i of word w is set if index ``64 w + i`` is kept.
+        offsets: ``(R + 1,)`` int64; the samples of ray r are ``offsets[r] : offsets[r + 1]``.
+    """
+
+    origins: Tensor
+    directions: Tensor
+    near: Tensor
+    shift: Tensor
+    bits: Tensor
+    offsets: Tensor
+
+
+@exact
+def sample_at(o: Any, d: Any, axis: Any, distance: Any) -> Any:
+    """Coordinate of a sample along an axis."""
+    return o[axis] + distance * d[axis]
+
+
+@exact
+def distance_of(near: Any, shift: Any, step: Any, index: Any) -> Any:
+    """Distance of sample ``index`` along its ray."""
+    return near + (np.float32(index) + shift) * step
+
+
+@inline
+def next_bit(bits: Any, after: Any) -> Any:
+    """The first index from ``after`` on whose bit is set; 64 for each word if there is none."""
+    words = bits.shape[0]
+    word = after >> 6
+    rest = int64(0)
+    if word < words:
+        # The sign bit would be shifted in for ever.
+        low = after & 63
+        rest = bits[word] if low == 0 else (bits[word] >> low) & (_REST >> (low - 1))
+    while rest == 0:
+        word += 1
+        if word >= words:
+            return 64 * words
+        after = 64 * word
+        rest = bits[word]
+    while rest & 1 == 0:
+        rest = (rest >> 1) & _REST
+        after += 1
+    return after
 
 
 @kernel

@@ -1,159 +1,113 @@
 """Density along rays with early termination: samples that cannot be seen are hardly ever computed.
 
-A task walks along some rays from sample to sample, and leaves a ray where its transmittance falls below a bound.
+A task marches along some rays from sample to sample, and leaves a ray where its transmittance falls below a bound.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from gridreg.ops.cpu.cp import product_sum
-from gridreg.ops.cpu.grid_coordinates import BATCH, PLACES, find
+from gridreg.ops.cpu.cp import product_sum, segments_of
+from gridreg.ops.cpu.grid_coordinates import BATCH, COORDINATES, locate
 from gridreg.ops.cpu.jit.compiler import (
+    Cube,
+    Matrix,
+    Vector,
     exact,
     float32,
     inline,
     int32,
     int64,
-    integer,
     kernel,
-    matrix,
-    next_task,
-    real,
     scratch,
-    size,
-    vector,
-)
+)  # fmt: skip
 from gridreg.ops.cpu.jit.launch import launch
 from gridreg.ops.cpu.jit.simd import LANES, load, store, wide
 from gridreg.ops.cpu.jit.softplus import softplus
-from gridreg.ops.cpu.march_bits import MarchBits, distance_of, next_bit, sample_at
-from gridreg.ops.cpu.vm import find_cells, look_up
-from gridreg.ops.ray_marching import Activation
+from gridreg.ops.cpu.march import MarchBits, distance_of, next_bit, sample_at
+from gridreg.ops.cpu.vm import Batch, find_cells, look_up, shape_of
+from gridreg.ops.ray_marching import Activation, RayMarchResult
 
-__all__ = ["Walked", "walk"]
+__all__ = ["march_density"]
 
 # Samples between two looks at the transmittance: so many may be computed in vain behind the last one.
 _GROUP = LANES
 # Samples placed on the grid at a time, of which most may be in vain.
 _SPAN = 64
-_COORDINATES = 3 * _SPAN
+_POSITIONS = 3 * _SPAN
 # Rays of a task.
 _RAYS = 16
 
 
-@dataclass(frozen=True)
-class Walked:
-    """The samples that can be seen.
+class _Density(NamedTuple):
+    """From features to what a ray has passed: density ``scale * softplus(feature + shift)``, and the bound."""
 
-    Args:
-        offsets: ``(R + 1,)`` int64.
-        index: ``(N,)`` int64.
-        t: ``(N,)``, world units.
-        positions: ``(N, 3)``, world units.
-        u: ``(N, 3)``, the positions normalised to the box.
-        density: ``(N,)``, per world unit.
-    """
-
-    offsets: Tensor
-    index: Tensor
-    t: Tensor
-    positions: Tensor
-    u: Tensor
-    density: Tensor
+    box: Any
+    shift: Any
+    scale: Any
+    step: Any
+    limit: Any
 
 
 # Rounded as the plain version does it, so that both agree on what is inside.
 @exact
-def _normalised(x: Any, box: Any, axis: Any) -> Any:
+def _normalised(x: float32, box: Vector[float32], axis: int) -> Any:
     return (x - box[axis]) / (box[3 + axis] - box[axis])
 
 
 @inline
-def _cp_feature(table: Any, places: Any, q: Any, channels: Any, read: Any) -> Any:
-    """Sum over channels at sample ``q`` of a batch."""
-    nodes, shares = places
-    lines = vector(table, 13, float32), vector(table, 12, float32), vector(table, 11, float32)
-    x, y, z = int64(nodes[q]), int64(nodes[BATCH + q]), int64(nodes[2 * BATCH + q])
-    between = shares[q], shares[BATCH + q], shares[2 * BATCH + q]
-    return product_sum(lines, (x * channels, y * channels, z * channels), between, channels, read)
-
-
-@inline
-def _outside(u: Any, n: Any) -> Any:
+def _outside(u: Vector[float32], n: int) -> bool:
     x, y, z = u[3 * n], u[3 * n + 1], u[3 * n + 2]
-    return (
-        (x < float32(0))
-        | (x > float32(1))
-        | (y < float32(0))
-        | (y > float32(1))
-        | (z < float32(0))
-        | (z > float32(1))
-    )
+    zero, one = float32(0), float32(1)
+    return (x < zero) | (x > one) | (y < zero) | (y > one) | (z < zero) | (z > one)  # type: ignore[no-any-return]
 
 
 @inline
-def _place(table: Any, ray: Any, i: Any, count: Any, u: Any) -> Any:
+def _place(rays: Any, ray: int, i: int, count: int, density_of: Any, u: Vector[float32]) -> int:
     """Find the next samples of a ray behind index ``i``, normalise them to u, and return the last one's index."""
-    o, d = matrix(table, 0, float32), matrix(table, 1, float32)
-    near, shift, bits = vector(table, 2, float32), vector(table, 3, float32), matrix(table, 4, int64)
-    box, step = vector(table, 6, float32), real(table, 17)
+    o, d, bits = rays.origins[ray], rays.directions[ray], rays.bits[ray]
     for q in range(count):
-        i = next_bit(bits[ray], i + 1)
-        distance = distance_of(near[ray], shift[ray], step, i)
+        i = next_bit(bits, i + 1)
+        distance = distance_of(rays.near[ray], rays.shift[ray], density_of.step, i)
         for axis in range(3):
-            u[3 * q + axis] = _normalised(sample_at(o[ray], d[ray], axis, distance), box, axis)
+            u[3 * q + axis] = _normalised(sample_at(o, d, axis, distance), density_of.box, axis)
     return i
 
 
 @inline
-def _walk_ray(table: Any, ray: Any, u: Any, places: Any, cells: Any, features: Any, planar: Any) -> Any:
+def _march_ray(
+    rays: Any, ray: int, planes: Any, lines: Any, read: int, density_of: Any, u: Any, samples: Any, features: Any,
+    density: Any, planar: bool,
+) -> Any:  # fmt: skip
     """Fill density of the samples of a ray until it is opaque, and return how many can be seen."""
-    offsets, density = vector(table, 5, int64), vector(table, 7, float32)
-    read, shift, scale = integer(table, 14), real(table, 15), real(table, 16)
-    step, limit = real(table, 17), real(table, 18)
-    channels = size(table, 11, 1)
-    shape = size(table, 13, 0), size(table, 12, 0), size(table, 11, 0)
-    begin, end = offsets[ray], offsets[ray + 1]
+    begin, end = rays.offsets[ray], rays.offsets[ray + 1]
+    channels, shape, step = lines[0].shape[1], shape_of(lines), density_of.step
     depth, index = float32(0), int64(-1)
     for first in range(begin, end, _SPAN):
         count = min(int64(_SPAN), end - first)
-        index = _place(table, ray, index, count, u)
-        find(places, u, 0, count, shape)
+        index = _place(rays, ray, index, count, density_of, u)
+        locate(samples.nodes, samples.fractions, u, 0, count, shape)
         if planar:
-            find_cells(cells, places[0], count, shape, channels)
+            find_cells(samples, count, shape, channels)
         for start in range(0, count, _GROUP):
             stop = min(start + _GROUP, count)
             if planar:
                 for k in range(3):
-                    grids = vector(table, 8 + k, float32), vector(table, 11 + k, float32)
-                    look_up(
-                        grids,
-                        k,
-                        cells,
-                        places,
-                        (start, stop, count),
-                        shape,
-                        channels,
-                        read,
-                        features,
-                        0,
-                        True,
-                    )
+                    look_up(planes, lines, k, samples, (start, stop, count), read, features, 0, True)
             else:
                 for q in range(start, stop):
-                    features[q] = _cp_feature(table, places, q, channels, read)
+                    segments = segments_of(samples.nodes, samples.fractions, q, channels)
+                    features[q] = product_sum((lines[2], lines[1], lines[0]), segments, read)
             # The last group of a ray is filled up with leftovers.
-            values = softplus(load(features, start, wide()) + shift, wide()) * scale
+            values = softplus(load(features, start, wide()) + density_of.shift, wide()) * density_of.scale
             store(features, start, values)
             for q in range(start, stop):
-                if depth > limit:
+                if depth > density_of.limit:
                     return first + q - begin
                 value = float32(0) if _outside(u, q) else features[q]
                 density[first + q] = value
@@ -161,95 +115,103 @@ def _walk_ray(table: Any, ray: Any, u: Any, places: Any, cells: Any, features: A
     return end - begin
 
 
-@inline
-def _walk(table: Any, planar: Any) -> Any:
-    counts = vector(table, 19, int64)
-    u, places = scratch(_COORDINATES, float32), (scratch(PLACES, int32), scratch(PLACES, float32))
-    cells, features = scratch(PLACES, int32), scratch(BATCH, float32)
-    while True:
-        task = next_task(table)
-        if task < 0:
-            break
-        for ray in range(task * _RAYS, min((task + 1) * _RAYS, counts.shape[0])):
-            counts[ray] = _walk_ray(table, ray, u, places, cells, features, planar)
+@kernel
+def _march_vm(
+    task: int, origins: Matrix[float32], directions: Matrix[float32], near: Vector[float32], shift: Vector[float32],
+    bits: Matrix[int64], offsets: Vector[int64], xy: Cube[float32], xz: Cube[float32], yz: Cube[float32],
+    z: Matrix[float32], y: Matrix[float32], x: Matrix[float32], read: int64, box: Vector[float32],
+    feature_shift: float32, scale: float32, step: float32, limit: float32, density: Vector[float32],
+    counts: Vector[int64],
+) -> None:  # fmt: skip
+    """Density of a VM grid at the samples of some rays, and how many of them can be seen."""
+    u, features = scratch(_POSITIONS, float32), scratch(BATCH, float32)
+    samples = Batch(scratch(COORDINATES, int32), scratch(COORDINATES, float32), scratch(COORDINATES, int32))
+    rays = MarchBits(origins, directions, near, shift, bits, offsets)  # type: ignore[arg-type]
+    density_of = _Density(box, feature_shift, scale, step, limit)
+    planes, lines = (xy, xz, yz), (z, y, x)
+    for ray in range(task * _RAYS, min((task + 1) * _RAYS, counts.shape[0])):
+        counts[ray] = _march_ray(
+            rays, ray, planes, lines, read, density_of, u, samples, features, density, True
+        )
 
 
 @kernel
-def _vm_walk(table: Any) -> None:
-    """origins, directions, near, shift, bits, offsets, box, density, planes, lines, channels to read, shift, scale,
-    step, limit, counts."""
-    _walk(table, True)
+def _march_cp(
+    task: int, origins: Matrix[float32], directions: Matrix[float32], near: Vector[float32], shift: Vector[float32],
+    bits: Matrix[int64], offsets: Vector[int64], z: Matrix[float32], y: Matrix[float32], x: Matrix[float32],
+    read: int64, box: Vector[float32], feature_shift: float32, scale: float32, step: float32, limit: float32,
+    density: Vector[float32], counts: Vector[int64],
+) -> None:  # fmt: skip
+    """Density of a CP grid at the samples of some rays, and how many of them can be seen."""
+    u, features = scratch(_POSITIONS, float32), scratch(BATCH, float32)
+    samples = Batch(scratch(COORDINATES, int32), scratch(COORDINATES, float32), scratch(COORDINATES, int32))
+    rays = MarchBits(origins, directions, near, shift, bits, offsets)  # type: ignore[arg-type]
+    density_of = _Density(box, feature_shift, scale, step, limit)
+    lines = (z, y, x)
+    for ray in range(task * _RAYS, min((task + 1) * _RAYS, counts.shape[0])):
+        # Lines stand in for the planes, which are not read.
+        counts[ray] = _march_ray(
+            rays, ray, lines, lines, read, density_of, u, samples, features, density, False
+        )
 
 
 @kernel
-def _cp_walk(table: Any) -> None:
-    """Arguments as of `_vm_walk`; planes are not read."""
-    _walk(table, False)
+def _write(
+    task: int, origins: Matrix[float32], directions: Matrix[float32], near: Vector[float32], shift: Vector[float32],
+    bits: Matrix[int64], old: Vector[int64], density: Vector[float32], box: Vector[float32], step: float32,
+    new: Vector[int64], index: Vector[int64], t: Vector[float32], positions: Vector[float32],
+    kept: Vector[float32], u: Vector[float32],
+) -> None:  # fmt: skip
+    """Write out the samples that can be seen; ``old`` and ``new`` are offsets before and after."""
+    for ray in range(task * _RAYS, min((task + 1) * _RAYS, old.shape[0] - 1)):
+        start, i = old[ray] - new[ray], int64(-1)
+        for n in range(new[ray], new[ray + 1]):
+            i = next_bit(bits[ray], i + 1)
+            distance = distance_of(near[ray], shift[ray], step, i)
+            index[n], t[n], kept[n] = i, distance, density[n + start]
+            for axis in range(3):
+                coordinate = sample_at(origins[ray], directions[ray], axis, distance)
+                positions[3 * n + axis] = coordinate
+                u[3 * n + axis] = _normalised(coordinate, box, axis)
 
 
-@kernel
-def _write(table: Any) -> None:
-    """The first six as of `_vm_walk`, then new offsets, box, density, step; index, t, positions, u,
-    density."""
-    o, d = matrix(table, 0, float32), matrix(table, 1, float32)
-    near, shift, bits = vector(table, 2, float32), vector(table, 3, float32), matrix(table, 4, int64)
-    old, new = vector(table, 5, int64), vector(table, 6, int64)
-    box, density, step = vector(table, 7, float32), vector(table, 8, float32), real(table, 9)
-    index, t, x = vector(table, 10, int64), vector(table, 11, float32), vector(table, 12, float32)
-    u, to_density = vector(table, 13, float32), vector(table, 14, float32)
-    while True:
-        task = next_task(table)
-        if task < 0:
-            break
-        for ray in range(task * _RAYS, min((task + 1) * _RAYS, old.shape[0] - 1)):
-            start, i = old[ray] - new[ray], int64(-1)
-            for n in range(new[ray], new[ray + 1]):
-                i = next_bit(bits[ray], i + 1)
-                distance = distance_of(near[ray], shift[ray], step, i)
-                index[n], t[n], to_density[n] = i, distance, density[n + start]
-                for axis in range(3):
-                    coordinate = sample_at(o[ray], d[ray], axis, distance)
-                    x[3 * n + axis] = coordinate
-                    u[3 * n + axis] = _normalised(coordinate, box, axis)
-
-
-def walk(
+def march_density(
     marked: MarchBits,
-    *grids: Sequence[Tensor],
+    planes: Sequence[Tensor],
+    lines: Sequence[Tensor],
+    *,
     read: int,
     activation: Activation,
     step: float,
     transmittance_bound: float,
-) -> Walked:
-    """Density at the samples of a march up to where a ray is opaque.
+) -> tuple[RayMarchResult, Tensor]:
+    """Density at the samples of a march up to where a ray is opaque, not differentiable.
 
     Args:
         marked: the samples, as `gridreg.ops.cpu.march.mark` returns them.
-        grids: three planes, unless the grid is a CP grid, and three lines.
+        planes: three, or none for a CP grid.
+        lines: three.
         read: number of channels to use.
         activation: from features to densities.
         step: length of a sample's interval, world units.
         transmittance_bound: samples behind a smaller transmittance are dropped.
+
+    Returns:
+        The samples that can be seen, and their positions normalised to the box ``(N, 3)``.
     """
-    planar, lines = len(grids) > 1, grids[-1]
     rays, samples = len(marked.offsets) - 1, int(marked.offsets[-1])
     tasks, box = -(-rays // _RAYS) if samples else 0, activation.bounds.contiguous()
     density, counts = torch.empty(samples), torch.zeros(rays, dtype=torch.int64)
     limit = -math.log(transmittance_bound) if transmittance_bound > 0 else math.inf
-    # A CP grid gives its lines once more in place of planes, which are not read then.
     launch(
-        _vm_walk if planar else _cp_walk, tasks, *marked, box, density, *grids[0], *lines, read,
-        float(activation.shift), float(activation.scale), float(step), limit, counts,
+        _march_vm if planes else _march_cp, tasks, *marked, *planes, *lines, read, box, float(activation.shift),
+        float(activation.scale), float(step), limit, density, counts,
     )  # fmt: skip
-    seen = torch.zeros_like(marked.offsets)
-    torch.cumsum(counts, 0, out=seen[1:])
-    kept = int(seen[-1])
-    found = (
-        torch.empty(kept, dtype=torch.int64),
-        torch.empty(kept),
-        torch.empty(kept, 3),
-        torch.empty(kept, 3),
-        torch.empty(kept),
-    )
-    launch(_write, tasks if kept else 0, *marked, seen, box, density, float(step), *found)
-    return Walked(seen, *found)
+    offsets = torch.zeros_like(marked.offsets)
+    torch.cumsum(counts, 0, out=offsets[1:])
+    count = int(offsets[-1])
+    index, t, positions = torch.empty(count, dtype=torch.int64), torch.empty(count), torch.empty(count, 3)
+    kept, u = torch.empty(count), torch.empty(count, 3)
+    found = (offsets, index, t, positions, kept)
+    launch(_write, tasks if count else 0, *marked, density, box, float(step), *found, u)
+    return RayMarchResult(*found), u

@@ -3,148 +3,163 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from gridreg.ops.cpu.grid_coordinates import BATCH, PLACES, axes, batch, find
-from gridreg.ops.cpu.interpolation import ahead, bilinear, corners, linear, prefetch_cell
+from gridreg.ops.cpu.grid_coordinates import BATCH, COORDINATES, axes, batch, locate
+from gridreg.ops.cpu.interpolation import (
+    Cell,
+    Segment,
+    bilinear,
+    cell_weights,
+    linear,
+    lookahead,
+    prefetch_cell,
+)
 from gridreg.ops.cpu.jit.bfloat16 import put
 from gridreg.ops.cpu.jit.compiler import (
+    Cube,
+    Matrix,
+    Vector,
     float32,
     inline,
     int32,
     int64,
-    integer,
     kernel,
-    next_task,
     scratch,
-    size,
     uint16,
-    vector,
-)
+)  # fmt: skip
 from gridreg.ops.cpu.jit.launch import launch
 from gridreg.ops.cpu.jit.simd import LANES, one, total, wide
 
-__all__ = ["density", "features", "find_cells", "look_up", "low_features"]
+__all__ = ["Batch", "density", "features", "find_cells", "look_up", "shape_of"]
+
+
+class Batch(NamedTuple):
+    """Samples placed on the grid: nodes and fractions as of `locate`, first element of their cells in each plane."""
+
+    nodes: Any
+    fractions: Any
+    cells: Any
 
 
 @inline
-def _product(grids: Any, at: Any, below: Any, channels: Any, down: Any, w: Any, share: Any, like: Any) -> Any:
-    plane, line = grids
-    return bilinear(plane, at, channels, down, w, like) * linear(line, below, channels, share, like)
+def shape_of(lines: Any) -> tuple[int, int, int]:
+    """Nodes along x, y and z; line k lies along axis 2 - k."""
+    return lines[2].shape[0], lines[1].shape[0], lines[0].shape[0]
 
 
 @inline
-def _sum(grids: Any, at: Any, below: Any, channels: Any, down: Any, w: Any, share: Any, read: Any) -> Any:
-    """Sum over channels of plane times line; ``at`` and ``below`` are their first elements, ``down`` a row's length."""
+def _product(plane: Any, line: Any, cell: Any, segment: Any, c: int, dtype_like: Any) -> Any:
+    return bilinear(plane, cell, c, dtype_like) * linear(line, segment, c, dtype_like)
+
+
+@inline
+def _sum(plane: Any, line: Any, cell: Any, segment: Any, read: int) -> Any:
+    """Sum over channels of plane times line."""
     blocks = read - read % LANES
     lanes = wide()
     for c in range(0, blocks, LANES):
-        lanes = lanes + _product(grids, at + c, below + c, channels, down, w, share, wide())
+        lanes = lanes + _product(plane, line, cell, segment, c, wide())
     value = total(lanes)
     for c in range(blocks, read):
-        value += _product(grids, at + c, below + c, channels, down, w, share, one())
+        value += _product(plane, line, cell, segment, c, one())
     return value
 
 
 @inline
-def _write(
-    grids: Any,
-    at: Any,
-    below: Any,
-    channels: Any,
-    down: Any,
-    w: Any,
-    share: Any,
-    read: Any,
-    out: Any,
-    to: Any,
-) -> Any:
+def _write(plane: Any, line: Any, cell: Any, segment: Any, read: int, out: Any, to: int) -> None:
     """Plane times line to ``out`` from element ``to`` on; 0 for channels that are not read."""
     blocks = read - read % LANES
     for c in range(0, blocks, LANES):
-        put(out, to + c, _product(grids, at + c, below + c, channels, down, w, share, wide()))
+        put(out, to + c, _product(plane, line, cell, segment, c, wide()))
     for c in range(blocks, read):
-        put(out, to + c, _product(grids, at + c, below + c, channels, down, w, share, one()))
-    for c in range(read, channels):
+        put(out, to + c, _product(plane, line, cell, segment, c, one()))
+    for c in range(read, cell.across):
         put(out, to + c, one())
 
 
 @inline
-def find_cells(cells: Any, nodes: Any, count: Any, shape: Any, channels: Any) -> Any:
+def find_cells(samples: Any, count: int, shape: tuple[int, int, int], channels: int) -> None:
     """Write where the cells of a batch begin in the three planes."""
     for k in range(3):
         a, b, _ = axes(k)
         columns, width = int32(shape[b]), int32(channels)
         for q in range(count):
-            cells[k * BATCH + q] = (nodes[a * BATCH + q] * columns + nodes[b * BATCH + q]) * width
+            node = samples.nodes[a * BATCH + q] * columns + samples.nodes[b * BATCH + q]
+            samples.cells[k * BATCH + q] = node * width
 
 
 @inline
 def look_up(
-    grids: Any, k: Any, cells: Any, places: Any, part: Any, shape: Any, channels: Any, read: Any, out: Any, n: Any,
-    summed: Any,
-) -> Any:  # fmt: skip
+    planes: Any, lines: Any, k: int, samples: Any, part: tuple[int, int, int], read: int, out: Any, n: int,
+    summed: bool,
+) -> None:  # fmt: skip
     """Product of plane and line ``k`` at a part (start, stop, count) of a batch whose first sample is ``n``.
 
     If ``summed``, its sum over channels is added to ``out``, else its channels are written to their place.
     """
-    nodes, shares = places
     start, stop, count = part
-    a, b, v = axes(k)
-    down, far = shape[b] * channels, ahead(read)
-    cell = k * BATCH
-    a, b, v = a * BATCH, b * BATCH, v * BATCH
+    plane, line = planes[k], lines[k]
+    channels, (a, b, v) = line.shape[1], axes(k)
+    down, far = plane.shape[1] * channels, lookahead(read)
+    first, a, b, v = k * BATCH, a * BATCH, b * BATCH, v * BATCH
+    nodes, fractions, cells = samples.nodes, samples.fractions, samples.cells
     for q in range(start, stop):
         if q + far < count:
-            prefetch_cell(grids[0], int64(cells[cell + q + far]), channels, down, read)
-        at, below, share = int64(cells[cell + q]), int64(nodes[v + q]) * channels, shares[v + q]
-        w = corners(shares[a + q], shares[b + q])
+            prefetch_cell(plane, int64(cells[first + q + far]), channels, down, read)
+        weights = cell_weights(fractions[a + q], fractions[b + q])
+        cell = Cell(int64(cells[first + q]), channels, down, weights)
+        segment = Segment(int64(nodes[v + q]) * channels, channels, fractions[v + q])
         if summed:
-            value = _sum(grids, at, below, channels, down, w, share, read)
+            value = _sum(plane, line, cell, segment, read)
             out[n + q] = value if k == 0 else out[n + q] + value
         else:
-            _write(grids, at, below, channels, down, w, share, read, out, (3 * (n + q) + k) * channels)
+            _write(plane, line, cell, segment, read, out, (3 * (n + q) + k) * channels)
 
 
 @inline
-def _forward(table: Any, out: Any, summed: Any) -> Any:
-    u, read = vector(table, 0, float32), integer(table, 7)
-    samples, channels = size(table, 0, 0), size(table, 4, 1)
-    shape = size(table, 6, 0), size(table, 5, 0), size(table, 4, 0)
-    places = scratch(PLACES, int32), scratch(PLACES, float32)
-    cells = scratch(PLACES, int32)
-    while True:
-        task = next_task(table)
-        if task < 0:
-            break
-        first, last = batch(task, samples)
-        count = last - first
-        find(places, u, first, count, shape)
-        find_cells(cells, places[0], count, shape, channels)
-        for k in range(3):
-            grids = vector(table, 1 + k, float32), vector(table, 4 + k, float32)
-            look_up(grids, k, cells, places, (0, count, count), shape, channels, read, out, first, summed)
+def _forward(
+    task: int, u: Any, planes: Any, lines: Any, read: int, samples: Any, out: Any, summed: bool
+) -> None:
+    first, last = batch(task, u.shape[0])
+    count, shape = last - first, shape_of(lines)
+    locate(samples.nodes, samples.fractions, u, first, count, shape)
+    find_cells(samples, count, shape, lines[0].shape[1])
+    for k in range(3):
+        look_up(planes, lines, k, samples, (0, count, count), read, out, first, summed)
 
 
 @kernel
-def _density(table: Any) -> None:
-    """u, three planes, three lines, channels to read, out."""
-    _forward(table, vector(table, 8, float32), True)
+def _density(
+    task: int, u: Matrix[float32], xy: Cube[float32], xz: Cube[float32], yz: Cube[float32], z: Matrix[float32],
+    y: Matrix[float32], x: Matrix[float32], read: int64, out: Vector[float32],
+) -> None:  # fmt: skip
+    """Sum over planes, lines and channels."""
+    samples = Batch(scratch(COORDINATES, int32), scratch(COORDINATES, float32), scratch(COORDINATES, int32))
+    _forward(task, u, (xy, xz, yz), (z, y, x), read, samples, out, True)
 
 
 @kernel
-def _features(table: Any) -> None:
-    """u, three planes, three lines, channels to read, out."""
-    _forward(table, vector(table, 8, float32), False)
+def _features(
+    task: int, u: Matrix[float32], xy: Cube[float32], xz: Cube[float32], yz: Cube[float32], z: Matrix[float32],
+    y: Matrix[float32], x: Matrix[float32], read: int64, out: Vector[float32],
+) -> None:  # fmt: skip
+    """Products of planes and lines, channel by channel."""
+    samples = Batch(scratch(COORDINATES, int32), scratch(COORDINATES, float32), scratch(COORDINATES, int32))
+    _forward(task, u, (xy, xz, yz), (z, y, x), read, samples, out, False)
 
 
 @kernel
-def _low_features(table: Any) -> None:
-    """Arguments as of `_features`; out is bfloat16."""
-    _forward(table, vector(table, 8, uint16), False)
+def _bf16_features(
+    task: int, u: Matrix[float32], xy: Cube[float32], xz: Cube[float32], yz: Cube[float32], z: Matrix[float32],
+    y: Matrix[float32], x: Matrix[float32], read: int64, out: Vector[uint16],
+) -> None:  # fmt: skip
+    """`_features`, rounded to bfloat16."""
+    samples = Batch(scratch(COORDINATES, int32), scratch(COORDINATES, float32), scratch(COORDINATES, int32))
+    _forward(task, u, (xy, xz, yz), (z, y, x), read, samples, out, False)
 
 
 def density(u: Tensor, planes: Sequence[Tensor], lines: Sequence[Tensor], read: int) -> Tensor:
@@ -163,11 +178,6 @@ def features(
 ) -> Tensor:
     """``(N, 3 C)`` of ``dtype``, float32 or bfloat16; arguments as for `density`."""
     out = torch.empty(u.shape[0], 3 * lines[0].shape[1], dtype=dtype)
-    compiled = _low_features if dtype == torch.bfloat16 else _features
+    compiled = _bf16_features if dtype == torch.bfloat16 else _features
     launch(compiled, -(-u.shape[0] // BATCH), u, *planes, *lines, read, out)
     return out
-
-
-def low_features(u: Tensor, planes: Sequence[Tensor], lines: Sequence[Tensor], read: int) -> Tensor:
-    """`features` in bfloat16."""
-    return features(u, planes, lines, read, torch.bfloat16)

@@ -1,221 +1,259 @@
-"""Compiled lookups of VM grids: gradients with respect to planes and lines."""
+"""Compiled lookups of VM grids: gradients with respect to planes and lines.
+
+A task owns some rows of one plane and, for the line beside it, has a copy of its own; copies are added up afterwards.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from gridreg.ops.cpu.counting_sort import ALONE, ENTRY, TASKS, felt, list_by_row, span
+from gridreg.ops.cpu.counting_sort import ALONE, ENTRY, TASKS, list_by_row, nonzero_gradients, span
 from gridreg.ops.cpu.grid_coordinates import axes
-from gridreg.ops.cpu.interpolation import ahead, bilinear, corners, linear, prefetch_cell, prefetch_row
+from gridreg.ops.cpu.interpolation import (
+    Cell,
+    Segment,
+    bilinear,
+    cell_weights,
+    linear,
+    lookahead,
+    prefetch_cell,
+    prefetch_row,
+)  # fmt: skip
 from gridreg.ops.cpu.jit.bfloat16 import get
 from gridreg.ops.cpu.jit.compiler import (
+    Cube,
     Kernel,
+    Matrix,
+    Vector,
     float32,
     inline,
     int32,
     int64,
-    integer,
     kernel,
-    next_task,
-    size,
     uint16,
-    vector,
 )
 from gridreg.ops.cpu.jit.launch import launch
 from gridreg.ops.cpu.jit.simd import LANES, load, one, store, wide
-from gridreg.ops.cpu.jit.workspace import room
+from gridreg.ops.cpu.jit.workspace import workspace
 from gridreg.ops.cpu.reductions import reduce_sum
 
 __all__ = ["density_backward", "features_backward"]
 
 
+class _Target(NamedTuple):
+    """Where the gradient of a sample is added: arrays, and the element of each at which its channels begin.
+
+    ``lower`` and ``upper`` are for the two rows of the plane that the sample lies between. What falls on a row of
+    another task, which sees the sample too, goes to an array that nobody reads.
+    """
+
+    lower: Any
+    lower_first: Any
+    upper: Any
+    upper_first: Any
+    line: Any
+    line_first: Any
+
+
+class _Owned(NamedTuple):
+    """What a task may add to.
+
+    Args:
+        plane: gradient of the plane.
+        lower, upper, line: arrays as of `_Target`.
+        owns_lower, owns_upper: whether the row below and the row above the samples at hand are the task's own.
+        line_first: element at which the task's copy of the line begins.
+        waste_first: the task's part of the array that nobody reads.
+    """
+
+    plane: Any
+    lower: Any
+    upper: Any
+    line: Any
+    owns_lower: Any
+    owns_upper: Any
+    line_first: Any
+    waste_first: Any
+
+
 @inline
-def _add(
-    grids: Any, at: Any, below: Any, down: Any, w: Any, share: Any, g: Any, to: Any, i: Any, j: Any, m: Any,
-    channels: Any, like: Any,
-) -> Any:  # fmt: skip
-    """Add the gradient of some channels of a sample to four nodes of the plane and two of the line.
+def _target(owned: Any, cell: Any, segment: Any) -> Any:
+    lower = cell.first if owned.owns_lower else owned.waste_first
+    upper = cell.first + cell.down if owned.owns_upper else owned.waste_first
+    line = owned.line_first + segment.first if owned.owns_lower else owned.waste_first
+    return _Target(owned.lower, lower, owned.upper, upper, owned.line, line)
+
+
+@inline
+def _add(plane: Any, line: Any, cell: Any, segment: Any, c: int, g: Any, to: Any, dtype_like: Any) -> None:
+    """Add the gradient of channels from ``c`` on of a sample to four nodes of the plane and two of the line.
 
     All is read before anything is written: a processor holds a load back behind a store that agrees with it in the low
     bits of the address, and a gradient lies where its parameter does, but for these.
     """
-    plane, line = grids
-    to_lower, to_upper, to_line = to
-    on_plane = linear(line, below, channels, share, like) * g
-    on_line = bilinear(plane, at, channels, down, w, like) * g
-    p00 = load(to_lower, i, like) + on_plane * w[0]
-    p01 = load(to_lower, i + channels, like) + on_plane * w[1]
-    p10 = load(to_upper, j, like) + on_plane * w[2]
-    p11 = load(to_upper, j + channels, like) + on_plane * w[3]
-    l0 = load(to_line, m, like) + on_line * (float32(1) - share)
-    l1 = load(to_line, m + channels, like) + on_line * share
-    store(to_lower, i, p00)
-    store(to_lower, i + channels, p01)
-    store(to_upper, j, p10)
-    store(to_upper, j + channels, p11)
-    store(to_line, m, l0)
-    store(to_line, m + channels, l1)
+    across, w, fraction = cell.across, cell.weights, segment.fraction
+    i, j, m = to.lower_first + c, to.upper_first + c, to.line_first + c
+    on_plane = linear(line, segment, c, dtype_like) * g
+    on_line = bilinear(plane, cell, c, dtype_like) * g
+    p00 = load(to.lower, i, dtype_like) + on_plane * w[0]
+    p01 = load(to.lower, i + across, dtype_like) + on_plane * w[1]
+    p10 = load(to.upper, j, dtype_like) + on_plane * w[2]
+    p11 = load(to.upper, j + across, dtype_like) + on_plane * w[3]
+    l0 = load(to.line, m, dtype_like) + on_line * (float32(1) - fraction)
+    l1 = load(to.line, m + across, dtype_like) + on_line * fraction
+    store(to.lower, i, p00)
+    store(to.lower, i + across, p01)
+    store(to.upper, j, p10)
+    store(to.upper, j + across, p11)
+    store(to.line, m, l0)
+    store(to.line, m + across, l1)
 
 
 @inline
-def _serve(
-    grids: Any, to_plane: Any, to: Any, keep: Any, base: Any, listing: Any, entries: Any, places: Any, columns: Any,
-    channels: Any, read: Any, upstream: Any, summed: Any,
-) -> Any:  # fmt: skip
-    """Add the gradients of a range of entries; what is not kept goes to the first elements after its base."""
-    nodes, shares = listing
-    a, b, v, k = places
-    blocks = read - read % LANES
-    down = columns * channels
-    far = ENTRY * ahead(read)
-    first, last = entries
+def _add_entries(
+    plane: Any, line: Any, k: int, nodes: Any, fractions: Any, first: int, last: int, owned: Any, read: int,
+    upstream: Any, summed: bool,
+) -> None:  # fmt: skip
+    """Add the gradients of a range of listed samples to plane and line ``k``."""
+    a, b, v = axes(k)
+    columns, channels = plane.shape[1], plane.shape[2]
+    down, far, blocks = columns * channels, ENTRY * lookahead(read), read - read % LANES
     for e in range(first, last, ENTRY):
         then = min(e + far, last - ENTRY)
         at = (int64(nodes[then + a]) * columns + int64(nodes[then + b])) * channels
-        prefetch_cell(grids[0], at, channels, down, read)
-        prefetch_cell(to_plane, at, channels, down, read)
+        prefetch_cell(plane, at, channels, down, read)
+        prefetch_cell(owned.plane, at, channels, down, read)
         if not summed:
             prefetch_row(upstream, (3 * int64(nodes[then + 3]) + k) * channels, read)
         at = (int64(nodes[e + a]) * columns + int64(nodes[e + b])) * channels
-        below, share = int64(nodes[e + v]) * channels, shares[e + v]
-        w = corners(shares[e + a], shares[e + b])
-        i, j = base[0] + (at & keep[0]), base[1] + ((at + down) & keep[1])
-        m = base[2] + (below & keep[0])
-        g = shares[e + 3]
-        n = (3 * int64(nodes[e + 3]) + k) * channels
+        cell = Cell(at, channels, down, cell_weights(fractions[e + a], fractions[e + b]))
+        segment = Segment(int64(nodes[e + v]) * channels, channels, fractions[e + v])
+        to = _target(owned, cell, segment)
+        g, n = fractions[e + 3], (3 * int64(nodes[e + 3]) + k) * channels
         for c in range(0, blocks, LANES):
-            gc = wide() + g if summed else get(upstream, n + c, wide())
-            _add(grids, at + c, below + c, down, w, share, gc, to, i + c, j + c, m + c, channels, wide())
+            _add(
+                plane,
+                line,
+                cell,
+                segment,
+                c,
+                wide() + g if summed else get(upstream, n + c, wide()),
+                to,
+                wide(),
+            )
         for c in range(blocks, read):
-            gc = g if summed else get(upstream, n + c, one())
-            _add(grids, at + c, below + c, down, w, share, gc, to, i + c, j + c, m + c, channels, one())
+            _add(plane, line, cell, segment, c, g if summed else get(upstream, n + c, one()), to, one())
+
+
+class _Grids(NamedTuple):
+    """Planes, lines and channels to read; gradients of planes, copies of those of lines, and what nobody reads."""
+
+    planes: Any
+    lines: Any
+    read: Any
+    to_planes: Any
+    to_lines: Any
+    waste: Any
 
 
 @inline
-def _clear_line(table: Any, k: Any, part: Any, channels: Any) -> Any:
-    """Set a task's copy of line ``k``'s gradient to 0, and return where it begins."""
-    first = part * size(table, 12, 1)
-    if k > 0:
-        first += size(table, 4, 0)
-    if k > 1:
-        first += size(table, 5, 0)
-    copies = vector(table, 12, float32)
-    for i in range(first * channels, (first + size(table, 4 + k, 0)) * channels):
-        copies[i] = float32(0)
-    return first * channels
-
-
-@inline
-def _backward(table: Any, upstream: Any, summed: Any) -> Any:
-    read, copies = integer(table, 7), vector(table, 12, float32)
-    starts, nodes, shares = vector(table, 13, int64), vector(table, 14, int32), vector(table, 15, float32)
-    waste = vector(table, 16, float32)
-    channels, samples, stride = size(table, 4, 1), size(table, 0, 0), size(table, 13, 1)
-    while True:
-        task = next_task(table)
-        if task < 0:
-            break
-        k, part = task // TASKS, task % TASKS
-        grids = vector(table, 1 + k, float32), vector(table, 4 + k, float32)
-        to_plane = vector(table, 9 + k, float32)
-        line, bin_ = _clear_line(table, k, part, channels), 2 * task * channels
-        a, b, v = axes(k)
-        rows, columns = size(table, 1 + k, 0), size(table, 1 + k, 1)
-        for where in range(3):
-            first, last = span(starts, a * stride, rows, part, where)
-            # What falls on rows of another task, which sees these samples too, goes to waste.
-            low, high = where != 0, where != 2
-            to = to_plane if low else waste, to_plane if high else waste, copies if low else waste
-            keep = int64(-1 if low else 0), int64(-1 if high else 0)
-            base = int64(0) if low else bin_, int64(0) if high else bin_, line if low else bin_
-            entries = ENTRY * (a * samples + first), ENTRY * (a * samples + last)
-            _serve(
-                grids, to_plane, to, keep, base, (nodes, shares), entries, (a, b, v, k), columns, channels, read,
-                upstream, summed,
-            )  # fmt: skip
+def _backward(task: int, grids: Any, listing: Any, upstream: Any, summed: bool) -> None:
+    k, part = task // TASKS, task % TASKS
+    plane, line, to_plane, to_lines = grids.planes[k], grids.lines[k], grids.to_planes[k], grids.to_lines
+    starts, nodes, fractions = listing
+    channels, z, y, x = (
+        line.shape[1],
+        grids.lines[0].shape[0],
+        grids.lines[1].shape[0],
+        grids.lines[2].shape[0],
+    )
+    line_first = (part * (x + y + z) + (z if k > 0 else 0) + (y if k > 1 else 0)) * channels
+    for i in range(line_first, line_first + line.shape[0] * channels):
+        to_lines[i] = float32(0)
+    samples, stride = nodes.shape[0] // (2 * ENTRY), starts.shape[0] // 2
+    a, _, _ = axes(k)
+    for third in range(3):
+        first, last = span(starts, a * stride, plane.shape[0], part, third)
+        lower, upper = third != 0, third != 2
+        owned = _Owned(
+            to_plane,
+            to_plane if lower else grids.waste,
+            to_plane if upper else grids.waste,
+            to_lines if lower else grids.waste,
+            lower, upper, line_first, 2 * task * channels,
+        )  # fmt: skip
+        first, last = ENTRY * (a * samples + first), ENTRY * (a * samples + last)
+        _add_entries(plane, line, k, nodes, fractions, first, last, owned, grids.read, upstream, summed)
 
 
 @kernel
-def _density_backward(table: Any) -> None:
-    """u, planes, lines, channels to read, upstream, plane gradients, line copies, listing, waste."""
-    _backward(table, vector(table, 8, float32), True)
+def _density_backward(
+    task: int, xy: Cube[float32], xz: Cube[float32], yz: Cube[float32], z: Matrix[float32], y: Matrix[float32],
+    x: Matrix[float32], read: int64, to_xy: Vector[float32], to_xz: Vector[float32], to_yz: Vector[float32],
+    to_lines: Vector[float32], waste: Vector[float32], starts: Vector[int64], nodes: Vector[int32],
+    fractions: Vector[float32], upstream: Vector[float32],
+) -> None:  # fmt: skip
+    """Gradients of planes and lines from one number a sample."""
+    grids = _Grids((xy, xz, yz), (z, y, x), read, (to_xy, to_xz, to_yz), to_lines, waste)
+    _backward(task, grids, (starts, nodes, fractions), upstream, True)
 
 
 @kernel
-def _features_backward(table: Any) -> None:
-    """Arguments as of `_density_backward`."""
-    _backward(table, vector(table, 8, float32), False)
+def _features_backward(
+    task: int, xy: Cube[float32], xz: Cube[float32], yz: Cube[float32], z: Matrix[float32], y: Matrix[float32],
+    x: Matrix[float32], read: int64, to_xy: Vector[float32], to_xz: Vector[float32], to_yz: Vector[float32],
+    to_lines: Vector[float32], waste: Vector[float32], starts: Vector[int64], nodes: Vector[int32],
+    fractions: Vector[float32], upstream: Vector[float32],
+) -> None:  # fmt: skip
+    """Gradients of planes and lines from one number a channel."""
+    grids = _Grids((xy, xz, yz), (z, y, x), read, (to_xy, to_xz, to_yz), to_lines, waste)
+    _backward(task, grids, (starts, nodes, fractions), upstream, False)
 
 
 @kernel
-def _low_features_backward(table: Any) -> None:
-    """Arguments as of `_density_backward`; upstream is bfloat16."""
-    _backward(table, vector(table, 8, uint16), False)
+def _bf16_features_backward(
+    task: int, xy: Cube[float32], xz: Cube[float32], yz: Cube[float32], z: Matrix[float32], y: Matrix[float32],
+    x: Matrix[float32], read: int64, to_xy: Vector[float32], to_xz: Vector[float32], to_yz: Vector[float32],
+    to_lines: Vector[float32], waste: Vector[float32], starts: Vector[int64], nodes: Vector[int32],
+    fractions: Vector[float32], upstream: Vector[uint16],
+) -> None:  # fmt: skip
+    """`_features_backward` of gradients in bfloat16."""
+    grids = _Grids((xy, xz, yz), (z, y, x), read, (to_xy, to_xz, to_yz), to_lines, waste)
+    _backward(task, grids, (starts, nodes, fractions), upstream, False)
 
 
 def _run(
-    compiled: Kernel,
-    u: Tensor,
-    planes: Sequence[Tensor],
-    lines: Sequence[Tensor],
-    read: int,
-    upstream: Tensor,
+    compiled: Kernel, u: Tensor, planes: Sequence[Tensor], lines: Sequence[Tensor], read: int, upstream: Tensor,
     plane_gradients: Sequence[Tensor],
-) -> list[Tensor]:
-    nodes = [line.shape[0] for line in lines]
-    u, upstream = felt(u, upstream)
+) -> list[Tensor]:  # fmt: skip
+    nodes, channels = [line.shape[0] for line in lines], lines[0].shape[1]
+    u, upstream = nonzero_gradients(u, upstream)
     listing = list_by_row(u, upstream, (nodes[2], nodes[1], nodes[0]), 2)
-    copies = room("copies", TASKS, sum(nodes), lines[0].shape[1])
-    waste = room("waste", 3 * TASKS, 2, lines[0].shape[1]).zero_()
+    copies = workspace("copies", TASKS, sum(nodes), channels)
+    waste = workspace("waste", 3 * TASKS, 2, channels).zero_()
     launch(
-        compiled,
-        3 * TASKS,
-        u,
-        *planes,
-        *lines,
-        read,
-        upstream,
-        *plane_gradients,
-        copies,
-        *listing,
-        waste,
+        compiled, 3 * TASKS, *planes, *lines, read, *plane_gradients, copies, waste, *listing, upstream,
         alone=u.shape[0] < ALONE,
-    )
+    )  # fmt: skip
     return list(torch.split(reduce_sum(copies), nodes))
 
 
 def density_backward(
-    u: Tensor,
-    planes: Sequence[Tensor],
-    lines: Sequence[Tensor],
-    read: int,
-    upstream: Tensor,
+    u: Tensor, planes: Sequence[Tensor], lines: Sequence[Tensor], read: int, upstream: Tensor,
     plane_gradients: Sequence[Tensor],
-) -> list[Tensor]:
-    """Adds to ``plane_gradients`` in place and returns the gradients of the lines; upstream ``(N,)``."""
+) -> list[Tensor]:  # fmt: skip
+    """Add to ``plane_gradients`` in place and return the gradients of the lines; upstream ``(N,)``."""
     return _run(_density_backward, u, planes, lines, read, upstream, plane_gradients)
 
 
 def features_backward(
-    u: Tensor,
-    planes: Sequence[Tensor],
-    lines: Sequence[Tensor],
-    read: int,
-    upstream: Tensor,
+    u: Tensor, planes: Sequence[Tensor], lines: Sequence[Tensor], read: int, upstream: Tensor,
     plane_gradients: Sequence[Tensor],
-) -> list[Tensor]:
-    """Adds to ``plane_gradients`` in place and returns the gradients of the lines; upstream ``(N, 3 C)``."""
-    low = upstream.dtype == torch.bfloat16
-    return _run(
-        _low_features_backward if low else _features_backward,
-        u,
-        planes,
-        lines,
-        read,
-        upstream,
-        plane_gradients,
-    )
+) -> list[Tensor]:  # fmt: skip
+    """Add to ``plane_gradients`` in place and return the gradients of the lines; upstream ``(N, 3 C)``."""
+    compiled = _bf16_features_backward if upstream.dtype == torch.bfloat16 else _features_backward
+    return _run(compiled, u, planes, lines, read, upstream, plane_gradients)

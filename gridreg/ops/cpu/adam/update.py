@@ -16,7 +16,7 @@ from gridreg.ops.cpu.jit.compiler import float32, inline, int64, kernel, matrix,
 from gridreg.ops.cpu.jit.launch import launch
 from gridreg.ops.cpu.jit.simd import LANES, load, one, store, total, wide
 from gridreg.ops.cpu.jit.simd_math import divide, flush, magnitude, sign, square_root
-from gridreg.ops.cpu.jit.workspace import room
+from gridreg.ops.cpu.jit.workspace import workspace
 
 __all__ = ["Job", "update", "update_flat"]
 
@@ -246,7 +246,7 @@ def update(jobs: Sequence[Job], shapes: Sequence[Layout]) -> list[list[float]]:
         return []
     tasks = grid_tasks(tuple(shapes), _BLOCKS)
     tensors = [job.tensors for job in jobs]
-    before, after = room("adam edges", 2, tasks.held)
+    before, after = workspace("adam edges", 2, tasks.held)
     launch(_edges, len(tasks.edges), tasks.edges, before, after, *(p for p, _, _, _ in tensors))
     sums = torch.zeros(len(tasks.parts), 5, dtype=torch.float64)
     flat = [tensor for four in tensors for tensor in four]

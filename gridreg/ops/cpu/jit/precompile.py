@@ -32,7 +32,7 @@ _ORDER = (
     "cpu.reductions._round",
     "cpu.reductions._measure",
     "cpu.composite._weights_backward",
-    "cpu.vm_gradient._low_features_backward",
+    "cpu.vm_gradient._bf16_features_backward",
     "cpu.counting_sort._sort",
     "cpu.mlp.dots._low",
     "cpu.mlp.dots._sum_rows",

@@ -11,16 +11,16 @@ import threading
 import torch
 from torch import Tensor
 
-__all__ = ["room"]
+__all__ = ["workspace"]
 
 _local = threading.local()
 
 
-def room(name: str, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+def workspace(name: str, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
     """A contiguous tensor of undefined content that is this thread's own until it asks for the same name again.
 
     Example:
-        >>> room("doctest", 2, 3).shape, room("doctest", 4).data_ptr() == room("doctest", 1).data_ptr()
+        >>> workspace("doctest", 2, 3).shape, workspace("doctest", 4).data_ptr() == workspace("doctest", 1).data_ptr()
         (torch.Size([2, 3]), True)
     """
     kept: dict[tuple[str, torch.dtype], Tensor] = _local.__dict__.setdefault("kept", {})

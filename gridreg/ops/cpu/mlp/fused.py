@@ -18,7 +18,7 @@ from torch.autograd.function import once_differentiable
 from gridreg.ops.cpu.jit.compiler import Kernel
 from gridreg.ops.cpu.jit.launch import launch
 from gridreg.ops.cpu.jit.simd import LANES
-from gridreg.ops.cpu.jit.workspace import room
+from gridreg.ops.cpu.jit.workspace import workspace
 from gridreg.ops.cpu.mlp import dots
 from gridreg.ops.cpu.mlp import fused_bf16 as perceptron_dots
 from gridreg.ops.cpu.mlp import fused_f32 as perceptron_float
@@ -128,7 +128,7 @@ def gradients(
         places.append((place, place + high * x.shape[1], high, x.shape[1]))
         arguments += [kind.pack(back.t(), high) if back.shape[1] else none, x, place]
         place += high * (x.shape[1] + 1)
-    sums = room("perceptron", TASKS, place)
+    sums = workspace("perceptron", TASKS, place)
     launch(
         kind.backward, TASKS, count, len(blocks), len(weights), inputs[0], gradient, columns,
         torch.zeros(_up(columns, 16)), sums, *arguments,
