@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from dataclasses import replace as _replace
 from functools import cached_property
 from typing import Any
@@ -11,17 +10,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gridreg._packing import check_samples, rectangle
 from gridreg.errors import InputError
 from gridreg.segments import optical_depth_to_weights, spread, sum_before, sum_per_ray
 
 __all__ = ["RaySamples"]
 
-
-_PER_SAMPLE = ("t", "delta", "index", "density", "weights")
-_PER_SAMPLE_3 = ("positions", "colours")
-_PER_RAY_3 = ("directions", "background")
-_PER_RAY = ("ray_start", "ray_steps", "target_opacity")
-_INTEGERS = ("offsets", "index", "ray_steps")
+# Programs close a ray with an interval of 1e10, so that it ends opaque: no length of anything in the scene.
+_ENDLESS = 1e9
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +48,11 @@ class RaySamples:
             row; None: the rays have no order.
         target_opacity: ``(R,)`` alpha, in [0, 1], of the pixel that each ray is compared with, NaN where it is not
             known; None: it is known of no ray.
+        target_depth: ``(R,)`` depth of that pixel by a file of the user's, in a unit of its own, growing with the
+            distance, NaN where it is not known; None: it is known of no ray.
+        images: ``(R,)`` int64, number of the image that each ray belongs to; None: all belong to one.
+        gradients: ``(N, 3)`` derivative of the density, or of a signed distance, by the position, or None.
+        proposals: samples of the proposal networks on the same rays, coarse ones first, or None.
 
     Raises:
         InputError: a tensor has another shape, dtype or device than said above.
@@ -78,51 +79,14 @@ class RaySamples:
     ray_steps: Tensor | None = None
     patch: tuple[int, int, int] | None = None
     target_opacity: Tensor | None = None
+    target_depth: Tensor | None = None
+    images: Tensor | None = None
+    gradients: Tensor | None = None
+    proposals: tuple[RaySamples, ...] | None = None
 
     def __post_init__(self) -> None:
-        if self.offsets.ndim != 1 or self.offsets.shape[0] < 1:
-            raise InputError(f"offsets must have shape (rays + 1,), found {tuple(self.offsets.shape)}")
-        rays, count = self.offsets.shape[0] - 1, self.t.shape[0] if self.t.ndim else -1
-        expected = {
-            **dict.fromkeys(_PER_SAMPLE, (count,)),
-            **dict.fromkeys(_PER_SAMPLE_3, (count, 3)),
-            **dict.fromkeys(_PER_RAY_3, (rays, 3)),
-            **dict.fromkeys(_PER_RAY, (rays,)),
-        }
-        for name, value in self._tensors():
-            if name in expected and tuple(value.shape) != expected[name]:
-                raise InputError(
-                    f"{name} must have shape {expected[name]} for {count} samples on {rays} rays, "
-                    f"found {tuple(value.shape)}"
-                )
-            integer = name in _INTEGERS
-            if not (value.dtype == torch.int64 if integer else value.is_floating_point()):
-                wanted = "int64" if integer else "a floating-point type"
-                raise InputError(f"{name} must be {wanted}, found {value.dtype}")
-            if value.device != self.t.device:
-                raise InputError(
-                    f"{name} is on {value.device}, but t is on {self.t.device}: one device for all"
-                )
-        # Reading the values would stop a GPU's queue, so elsewhere only the shapes are checked.
-        if self.offsets.device.type == "cpu":
-            ends = int(self.offsets[0]), int(self.offsets[-1])
-            if ends != (0, count) or bool((self.offsets[1:] < self.offsets[:-1]).any()):
-                raise InputError(
-                    f"offsets must rise from 0 to the {count} samples, found {ends[0]} to {ends[1]}"
-                )
-        if self.patch is not None and (min(self.patch) < 1 or self._patch_rays() > rays):
-            raise InputError(
-                f"patch {self.patch} needs {self._patch_rays()} rays at the end of the {rays} given"
-            )
-
-    def _tensors(self) -> Iterator[tuple[str, Tensor]]:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(value, Tensor):
-                yield field.name, value
-
-    def _patch_rays(self) -> int:
-        return self.patch[0] * self.patch[1] * self.patch[2] if self.patch is not None else 0
+        """Refuse shapes, types and devices that do not fit together."""
+        check_samples(self)
 
     @classmethod
     def from_dense(
@@ -134,11 +98,9 @@ class RaySamples:
         *,
         positions: Tensor | None = None,
         colours: Tensor | None = None,
-        directions: Tensor | None = None,
-        background: Tensor | None = None,
+        gradients: Tensor | None = None,
         valid: Tensor | None = None,
-        patch: tuple[int, int, int] | None = None,
-        target_opacity: Tensor | None = None,
+        **others: Any,
     ) -> RaySamples:
         """Pack a rectangle of `R` rays with `S` samples each.
 
@@ -147,66 +109,96 @@ class RaySamples:
             delta: ``(R, S)`` or ``(S,)`` lengths of the intervals, world units.
             density: ``(R, S)`` per world unit.
             weights: ``(R, S)``, or None: computed from density and delta.
-            positions: ``(R, S, 3)``, or None.
-            colours: ``(R, S, 3)``, or None.
-            directions: ``(R, 3)``, or None.
-            background: ``(R, 3)``, or None.
+            positions, colours, gradients: ``(R, S, 3)``, or None.
             valid: ``(R, S)`` bool; the others are skipped, and count as density 0. None: all are kept.
-            patch, target_opacity: as in `RaySamples`.
+            others: as in `RaySamples`: directions, background, patch, target_opacity, ...
 
         Raises:
             InputError: a shape differs, or `valid` is not bool.
         """
-        if density.ndim != 2:
-            raise InputError(f"density must have shape (rays, samples), found {tuple(density.shape)}")
+        t, delta, offsets, kept = rectangle(t, delta, density, valid)
         rays, width = density.shape
-        if valid is None:
-            valid = torch.ones(rays, width, dtype=torch.bool, device=density.device)
-        if valid.dtype != torch.bool or valid.shape != density.shape:
-            raise InputError(
-                f"valid must be bool of shape {(rays, width)}, found {valid.dtype} {tuple(valid.shape)}"
-            )
-        try:
-            t, delta = t.expand(rays, width), delta.expand(rays, width)
-        except RuntimeError as error:
-            raise InputError(
-                f"t and delta must have shape {(rays, width)} like density, "
-                f"found {tuple(t.shape)} and {tuple(delta.shape)}"
-            ) from error
-        for name, value, tail in (
-            ("weights", weights, ()),
-            ("positions", positions, (3,)),
-            ("colours", colours, (3,)),
-        ):
+
+        def pack(name: str, value: Tensor | None, *tail: int) -> Tensor | None:
             if value is not None and tuple(value.shape) != (rays, width, *tail):
                 raise InputError(f"{name} must have shape {(rays, width, *tail)}, found {tuple(value.shape)}")
-        offsets = torch.cat([valid.new_zeros(1, dtype=torch.int64), valid.sum(1).cumsum(0)])
-        kept = valid.flatten().nonzero()[:, 0]
+            return None if value is None else value.flatten(0, 1).index_select(0, kept)
 
-        def pack(value: Tensor) -> Tensor:
-            return value.flatten(0, 1).index_select(0, kept)
-
-        index = torch.arange(width, device=density.device).expand(rays, width)
+        packed: dict[str, Any] = {
+            "t": pack("t", t),
+            "delta": pack("delta", delta),
+            "index": pack("index", torch.arange(width, device=density.device).expand(rays, width)),
+            "density": pack("density", density),
+            "weights": pack("weights", weights),
+            "positions": pack("positions", positions, 3),
+            "colours": pack("colours", colours, 3),
+            "gradients": pack("gradients", gradients, 3),
+        }
         if weights is None:
-            packed_weights = optical_depth_to_weights(pack(density) * pack(delta), offsets)
-        else:
-            packed_weights = pack(weights)
-        return cls(
-            offsets=offsets,
-            t=pack(t),
-            delta=pack(delta),
-            index=pack(index),
-            density=pack(density),
-            weights=packed_weights,
-            positions=None if positions is None else pack(positions),
-            colours=None if colours is None else pack(colours),
-            directions=directions,
-            background=background,
-            ray_start=t[:, 0] if width else t.new_zeros(rays),
-            ray_steps=torch.full((rays,), width, dtype=torch.int64, device=density.device),
-            patch=patch,
-            target_opacity=target_opacity,
-        )
+            packed["weights"] = optical_depth_to_weights(packed["density"] * packed["delta"], offsets)
+        steps = torch.full((rays,), width, dtype=torch.int64, device=density.device)
+        start = t[:, 0] if width else t.new_zeros(rays)
+        return cls(offsets, ray_start=start, ray_steps=steps, **packed, **others)
+
+    @classmethod
+    def from_packed(
+        cls,
+        ray_indices: Tensor,
+        t_starts: Tensor,
+        t_ends: Tensor,
+        density: Tensor,
+        weights: Tensor | None = None,
+        *,
+        rays: int | None = None,
+        index: Tensor | None = None,
+        **others: Any,
+    ) -> RaySamples:
+        """Take packed samples as nerfacc, DVGO and ngp_pl give them.
+
+        The distance `t` of a sample is the middle of its interval. An interval of 1e10 or more, with which programs
+        close a ray, has no middle: its sample lies at its start, and its length counts for its weight alone.
+
+        Args:
+            ray_indices: ``(N,)`` ray of each sample, never decreasing; DVGO's `ray_id`.
+            t_starts, t_ends: ``(N,)`` ends of the intervals, world units, rising along a ray.
+            density: ``(N,)`` per world unit.
+            weights: ``(N,)``, or None: computed from the density and the intervals.
+            rays: number of rays `R`, nerfacc's `n_rays`; None: up to the last that has samples.
+            index: ``(N,)`` number of each sample on its ray, skipped ones included, DVGO's `step_id`; None: counted
+                from the first one given.
+            others: as in `RaySamples`: positions, colours, directions, ray_start, ray_steps, ...
+
+        Raises:
+            InputError: the rays are not in order, or a shape differs.
+
+        Example:
+            >>> ends = torch.tensor([1.0, 1e10, 3.0])
+            >>> rays = torch.tensor([0, 0, 2])
+            >>> samples = RaySamples.from_packed(rays, torch.tensor([0.0, 1.0, 2.0]), ends, torch.ones(3))
+            >>> samples.t.tolist(), samples.counts.tolist()
+            ([0.5, 1.0, 2.5], [2, 0, 1])
+        """
+        named = {"t_starts": t_starts, "t_ends": t_ends, "density": density, "ray_indices": ray_indices}
+        # Columns (N, 1) are how some of these programs keep them.
+        starts, ends, density, ray_indices = (v[:, 0] if v.shape[1:] == (1,) else v for v in named.values())
+        if any(v.shape != ray_indices.shape or v.ndim != 1 for v in (starts, ends, density)):
+            found = ", ".join(f"{name} {tuple(value.shape)}" for name, value in named.items())
+            raise InputError(f"samples: expected one value of each for every sample, found {found}")
+        ray_indices = ray_indices.long()
+        last = int(ray_indices[-1]) if len(ray_indices) and (rays is None or ray_indices.is_cpu) else -1
+        if ray_indices.is_cpu and bool((ray_indices.diff() < 0).any()):
+            raise InputError("ray_indices must never decrease; sort the samples by ray first")
+        rays = last + 1 if rays is None else rays
+        if last >= rays:
+            raise InputError(f"rays={rays}: found samples of ray {last}")
+        offsets = torch.searchsorted(ray_indices, torch.arange(rays + 1, device=ray_indices.device))
+        delta = (ends - starts).clamp(max=1e10)
+        t = torch.where(delta < _ENDLESS, starts + delta / 2, starts)
+        if index is None:
+            index = torch.arange(len(t), device=t.device) - offsets[ray_indices]
+        if weights is None:
+            weights = optical_depth_to_weights(density * delta, offsets)
+        return cls(offsets, t, delta, index.long(), density, weights.reshape(t.shape), **others)
 
     def __len__(self) -> int:
         """Number of samples, `N`."""
@@ -239,6 +231,11 @@ class RaySamples:
         return self.sum_per_ray(self.weights * self.t)
 
     @cached_property
+    def lengths(self) -> Tensor:
+        """`delta`, and 0 where a ray is closed by an interval of 1e9 or more, ``(N,)``, world units."""
+        return torch.where(self.delta < _ENDLESS, self.delta, torch.zeros_like(self.delta))
+
+    @cached_property
     def start(self) -> Tensor:
         """`ray_start`, or if None the entry inferred from each first kept sample, ``(R,)``, world units."""
         if self.ray_start is not None:
@@ -246,7 +243,7 @@ class RaySamples:
         if len(self) == 0:
             return self.t.new_zeros(self.rays)
         first = self.offsets[:-1].clamp(max=len(self) - 1)
-        entry = (self.t - self.index * self.delta).detach().index_select(0, first)
+        entry = (self.t - self.index * self.lengths).detach().index_select(0, first)
         return torch.where(self.counts > 0, entry, torch.zeros_like(entry))
 
     @cached_property

@@ -119,5 +119,6 @@ def optical_depth_to_weights(optical_depth: Tensor, offsets: Tensor) -> Tensor:
     ray_indices = torch.repeat_interleave(
         rays, offsets[1:] - offsets[:-1], output_size=optical_depth.shape[0]
     )
-    transmittance = torch.exp(-sum_before(optical_depth, offsets, ray_indices))
+    # Behind a depth of 1e3 nothing is seen; the 1e10 that closes a ray would use up the digits of all later ones.
+    transmittance = torch.exp(-sum_before(optical_depth.clamp(max=1e3), offsets, ray_indices))
     return transmittance * -torch.expm1(-optical_depth)

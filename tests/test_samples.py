@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd import gradcheck, gradgradcheck
 
+import gridreg
 from gridreg.errors import InputError
 from gridreg.samples import RaySamples
 from gridreg.segments import optical_depth_to_weights, spread, sum_before, sum_per_ray
@@ -188,3 +193,106 @@ def test_dense_width_too_small() -> None:
     samples = make_batch(2, 2, 4, kept=1.0).samples()
     with pytest.raises(InputError, match="width 2 is too small: the largest sample index is 3"):
         samples.to_dense(samples.t, 2)
+
+
+def packed(seed: int = 0, closed: float | None = None) -> dict[str, Tensor]:
+    """Samples of three rays, the middle one empty, as nerfacc has them; the last interval may close its ray."""
+    generator = torch.Generator().manual_seed(seed)
+    rays = torch.tensor([0, 0, 0, 2, 2])
+    starts = torch.tensor([0.5, 1.0, 1.5, 0.25, 0.75])
+    ends = starts + 0.5
+    if closed is not None:
+        ends[[2, 4]] = closed
+    return {
+        "ray_indices": rays, "t_starts": starts, "t_ends": ends, "density": torch.rand(5, generator=generator)
+    }  # fmt: skip
+
+
+def weights_in_numpy(data: dict[str, Tensor]) -> NDArray[np.float64]:
+    """Equation 3 of NeRF, ray by ray and sample by sample."""
+    found, depth, last = [], 0.0, -1
+    for ray, start, end, density in zip(*(value.double().tolist() for value in data.values()), strict=True):
+        depth = depth if ray == last else 0.0
+        last = ray
+        found.append(math.exp(-depth) * -math.expm1(-density * (end - start)))
+        depth += density * (end - start)
+    return np.array(found)
+
+
+class TestFromPacked:
+    @pytest.mark.parametrize("closed", [None, 1e10])
+    def test_weights_are_nerfs(self, closed: float | None) -> None:
+        data = packed(closed=closed)
+        samples = RaySamples.from_packed(**data)
+        np.testing.assert_allclose(samples.weights.numpy(), weights_in_numpy(data), rtol=1e-5)
+        if closed:
+            assert samples.opacity.tolist() == [1.0, 0.0, 1.0]
+
+    def test_a_sample_lies_in_the_middle_of_its_interval(self) -> None:
+        samples = RaySamples.from_packed(**packed(), rays=4)
+        assert samples.t.tolist() == [0.75, 1.25, 1.75, 0.5, 1.0]
+        assert samples.offsets.tolist() == [0, 3, 3, 5, 5]
+        assert samples.index.tolist() == [0, 1, 2, 0, 1]
+        assert samples.ray_indices.tolist() == packed()["ray_indices"].tolist()
+
+    @pytest.mark.parametrize("closed", [1e10, float("inf")])
+    def test_an_interval_that_closes_a_ray_lies_at_its_start_and_has_no_length(self, closed: float) -> None:
+        samples = RaySamples.from_packed(**packed(closed=closed))
+        assert samples.t.tolist() == [0.75, 1.25, 1.5, 0.5, 0.75]
+        assert samples.lengths.tolist() == [0.5, 0.5, 0.0, 0.5, 0.0]
+        assert samples.depth.max() <= 1.5
+        assert gridreg.distortion(samples).item() < 1
+
+    def test_the_dense_form_gives_the_same(self) -> None:
+        t = torch.tensor([[1.0, 2.0, 3.0]])
+        dense = RaySamples.from_dense(t, torch.tensor([1.0, 1.0, 1e10]), torch.full((1, 3), 0.3))
+        starts = torch.tensor([0.5, 1.5, 3.0])
+        found = RaySamples.from_packed(
+            torch.zeros(3), starts, torch.tensor([1.5, 2.5, 1e10]), torch.full((3,), 0.3)
+        )
+        for name in ("t", "weights", "depth", "lengths"):
+            torch.testing.assert_close(getattr(found, name), getattr(dense, name))
+        torch.testing.assert_close(gridreg.distortion(found), gridreg.distortion(dense))
+
+    def test_rays_that_are_closed_do_not_spoil_later_ones(self) -> None:
+        rays, density = 2000, torch.full((2000, 2), 50.0)
+        density[:, 0] = 0.5
+        samples = RaySamples.from_dense(torch.tensor([1.0, 2.0]), torch.tensor([1.0, 1e10]), density)
+        expected = torch.tensor([-math.expm1(-0.5), math.exp(-0.5)]).repeat(rays)
+        torch.testing.assert_close(samples.weights, expected)
+
+    def test_columns_and_further_fields_are_taken_as_they_are(self) -> None:
+        data = {name: value[:, None] for name, value in packed().items()}
+        samples = RaySamples.from_packed(
+            **data,
+            weights=torch.full((5, 1), 0.1),
+            index=torch.tensor([3, 4, 9, 0, 1]),
+            ray_start=torch.zeros(3),
+        )
+        assert samples.weights.tolist() == pytest.approx([0.1] * 5)
+        assert samples.steps.tolist() == [10, 0, 2]
+
+    def test_no_samples(self) -> None:
+        empty = {name: value[:0] for name, value in packed().items()}
+        assert RaySamples.from_packed(**empty).rays == 0
+        assert RaySamples.from_packed(**empty, rays=3).counts.tolist() == [0, 0, 0]
+
+    @pytest.mark.parametrize(
+        ("changes", "message"),
+        [
+            ({"ray_indices": torch.tensor([0, 2, 2, 1, 1])}, "must never decrease; sort"),
+            ({"rays": 2}, "rays=2: found samples of ray 2"),
+            ({"density": torch.ones(4)}, r"one value of each for every sample, found .*density \(4,\)"),
+            ({"index": torch.zeros(3)}, "index must have shape"),
+        ],
+    )
+    def test_what_does_not_fit_is_refused(self, changes: dict[str, Any], message: str) -> None:
+        with pytest.raises(InputError, match=message):
+            RaySamples.from_packed(**{**packed(), **changes})
+
+
+def test_proposals_have_the_same_rays() -> None:
+    samples = RaySamples.from_packed(**packed())
+    assert samples.replace(proposals=(samples,)).proposals == (samples,)
+    with pytest.raises(InputError, match="proposals must have samples on the same 3 rays"):
+        samples.replace(proposals=(RaySamples.from_packed(**packed(), rays=4),))

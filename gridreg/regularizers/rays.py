@@ -146,7 +146,7 @@ def distortion(samples: RaySamples, near: float | None = None, far: float | None
     """
     scale = 1.0 / _interval(near, far)
     total: Tensor = _Distortion.apply(  # type: ignore[no-untyped-call]
-        samples.weights, samples.t, samples.delta, samples.offsets, samples.ray_indices
+        samples.weights, samples.t, samples.lengths, samples.offsets, samples.ray_indices
     )
     return total * (scale / max(samples.rays, 1))
 
