@@ -31,7 +31,7 @@ from gridreg.export import (
     write_mesh,
 )
 from gridreg.export.compare import sample_surface
-from gridreg.export.pictures import picture
+from gridreg.export.images import to_image
 from gridreg.training import TrainOptions, configure, execute, open_scene
 from gridreg.training.files import check_output_folder
 from gridreg.training.images import labelled, row, save_png
@@ -74,7 +74,7 @@ def reconstruct(subject: Path, protocol: str, arguments: argparse.Namespace) -> 
             trainer.field, Path(out) / "mesh.ply", trainer.occupancy, resolution=arguments.resolution
         )
         model = model_of_trainer(trainer)
-        renders = [picture(model.render(camera), "rgb") for camera in cameras(truth)]  # type: ignore[arg-type]
+        renders = [to_image(model.render(camera), "rgb") for camera in cameras(truth)]  # type: ignore[arg-type]
     comparison = compare_meshes(mesh, truth)
     metrics["config"] = {**metrics["config"], "scene": subject.name}
     metrics["command"] = stored.command_line("benchmarks/bodies.py")

@@ -77,7 +77,7 @@ def ring_of_views(
     elevation: float | tuple[float, float] = 25.0,
     size: tuple[int, int] = (30, 40),
 ) -> Views:
-    """Cameras around the origin, z up, the first on the x axis; white pictures.
+    """Cameras around the origin, z up, the first on the x axis; white images.
 
     Args:
         count: number of views, evenly spread.

@@ -16,7 +16,7 @@ class FakeClient:
 
     def __init__(self, pose: torch.Tensor, size: tuple[int, int] = (60, 80)) -> None:
         self.client_id = 7
-        self.pictures: list[np.ndarray] = []
+        self.images: list[np.ndarray] = []
         self.files: list[tuple[str, bytes]] = []
         self.moved: Any = None
         self.camera = SimpleNamespace(
@@ -30,7 +30,7 @@ class FakeClient:
         return callback
 
     def _show(self, pixels: np.ndarray, **_: Any) -> None:
-        self.pictures.append(pixels)
+        self.images.append(pixels)
 
     def send_file_download(self, name: str, content: bytes, **_: Any) -> None:
         self.files.append((name, content))

@@ -201,8 +201,8 @@ def test_the_command_and_those_that_read_what_it_wrote(desk, tmp_path, monkeypat
         {"preset": "", "seed": 1, "steps": 40},
     ]
     assert np.isfinite(record["mean"]["psnr"])
-    assert main(["render", out, "--frames", "2", "--width", "16", "--out", f"{out}/film"]) == 0
-    assert len(list((tmp_path / "joined" / "film").glob("*.png"))) == 2
+    assert main(["render", out, "--frames", "2", "--width", "16", "--out", f"{out}/video"]) == 0
+    assert len(list((tmp_path / "joined" / "video").glob("*.png"))) == 2
     assert main(["mesh", out, "--resolution", "24", "--threshold", "0.5"]) == 0
     assert (tmp_path / "joined" / "mesh.ply").exists()
     capsys.readouterr()

@@ -136,15 +136,15 @@ def test_a_viewer_that_never_rests_changes_nothing_and_survives(alone):
                 if viewer.wants_update:
                     viewer.update(run.model)
                     updates += 1
-                shown = len(client.pictures)
+                shown = len(client.images)
                 end = time.monotonic() + 20
-                while len(client.pictures) == shown and time.monotonic() < end:
+                while len(client.images) == shown and time.monotonic() < end:
                     time.sleep(0.005)
         finally:
             stop.set()
             wanderer.join()
         assert "cannot draw" not in viewer._panel._status.content
     assert updates == 12
-    assert len(client.pictures) > 12
-    assert np.isfinite(np.stack([p.mean() for p in client.pictures])).all()
+    assert len(client.images) > 12
+    assert np.isfinite(np.stack([p.mean() for p in client.images])).all()
     assert all(torch.equal(a, b) for a, b in zip(alone, run.parameters(), strict=True))

@@ -37,7 +37,7 @@ class TestLens:
         with pytest.raises(InputError):
             Lens(*arguments)
 
-    def test_refuses_angles_without_a_picture(self):
+    def test_refuses_angles_without_a_image(self):
         with pytest.raises(InputError, match=r"angle=180\.0"):
             Lens.from_angle(180.0, 10, 10)
 

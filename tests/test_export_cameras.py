@@ -74,7 +74,7 @@ def test_look_at_is_rigid_and_the_middle_ray_meets_the_target(position, target, 
     ray = camera_rays(camera.pose, torch.tensor([40.0, 40, 0.5, 0.5]), 1, 1)
     towards = np.subtract(target, position) / np.linalg.norm(np.subtract(target, position))
     np.testing.assert_allclose(ray.directions[0].numpy(), towards, atol=1e-5)
-    # What is up in the world is not down in the picture.
+    # What is up in the world is not down in the image.
     assert camera.pose[:3, 1].numpy() @ np.array(up) > -1e-5 * np.linalg.norm(up)
 
 
@@ -117,7 +117,7 @@ class TestOrbit:
         orbit = orbit_of_views(ring_of_views(6), torch.tensor([[2.0, 2, 2], [4, 4, 4]]))
         np.testing.assert_allclose(orbit.centre, [3, 3, 3])
 
-    def test_around_a_box_the_box_fits_into_the_picture(self):
+    def test_around_a_box_the_box_fits_into_the_image(self):
         bounds = torch.tensor([[0.0, 0, 0], [1, 2, 3]])
         orbit = orbit_of_box(bounds, angle=40.0)
         for camera in turntable(orbit, Lens.from_angle(40.0, 100, 100), 5):

@@ -37,10 +37,10 @@ class TestFfmpeg:
 
         monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", none)
         with pytest.raises(InputError, match=r"ffmpeg: found none, expected the program for \.mp4") as error:
-            render_video(model, tmp_path / "film.mp4", cameras_of(1))
+            render_video(model, tmp_path / "video.mp4", cameras_of(1))
         assert "\n" not in str(error.value)
         assert model.field.largest_batch == 0
-        render_video(model, tmp_path / "film.gif", cameras_of(1))
+        render_video(model, tmp_path / "video.gif", cameras_of(1))
 
     def test_named_in_the_environment_but_not_there(self, tmp_path, monkeypatch):
         monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", lambda: str(tmp_path / "ffmpeg"))
@@ -58,7 +58,7 @@ class TestFfmpeg:
         monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", lambda: str(program))
         big = [np.zeros((200, 200, 3), np.uint8)] * 5
         with pytest.raises(InputError, match=r"^ffmpeg: failed with No space left on device$"):
-            write_video(tmp_path / "film.mp4", big)
+            write_video(tmp_path / "video.mp4", big)
         assert [p.name for p in tmp_path.iterdir()] == ["ffmpeg"]
 
     def test_stopped_when_rendering_fails(self, tmp_path, monkeypatch):
@@ -76,7 +76,7 @@ class TestFfmpeg:
             raise KeyboardInterrupt
 
         with pytest.raises(KeyboardInterrupt):
-            write_video(tmp_path / "film.mp4", interrupted())
+            write_video(tmp_path / "video.mp4", interrupted())
         # Looking for the program may have started it before, to ask for its version.
         (running,) = [process for process in started if "rawvideo" in process.args]
         assert running.returncode not in (None, 0)

@@ -34,7 +34,7 @@ def page(viewer: Viewer, tmp_path_factory: pytest.TempPathFactory) -> Iterator[P
 
 
 def ball(page: Page) -> np.ndarray:
-    """Mean colour in the middle of the picture, left of the panel."""
+    """Mean colour in the middle of the image, left of the panel."""
     height, width = WINDOW[1], WINDOW[0]
     shot = page.screenshot()[height // 2 - 20 : height // 2 + 20, width // 2 - 20 : width // 2 + 20]
     return shot.reshape(-1, 3).mean(axis=0)

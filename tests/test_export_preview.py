@@ -104,7 +104,7 @@ def test_a_field_that_cannot_be_copied_is_named():
 
 
 class TestPace:
-    def test_slow_rays_make_small_pictures(self):
+    def test_slow_rays_make_small_images(self):
         fast, slow = Pace(), Pace()
         for _ in range(10):
             fast.saw(10_000, 0.01)
@@ -120,7 +120,7 @@ class TestPace:
             widths.append(width)
         assert widths == [100, 200, 400, 700] or widths == [100, 200, 700]
 
-    def test_pictures_without_rays_tell_nothing(self):
+    def test_images_without_rays_tell_nothing(self):
         pace = Pace()
         before = pace.moving(10_000, 1.0)
         pace.saw(0, 3.0)

@@ -1,4 +1,4 @@
-"""Runs as models, films, meshes, and watched while they are under way."""
+"""Runs as models, videos, meshes, and watched while they are under way."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_a_loaded_run_looks_like_the_trained_one(scene: Scene, tmp_path: Path) -
     assert not torch.equal(bare.colour, two.colour)
 
 
-def test_film_paths(scene: Scene, forward: Scene) -> None:
+def test_video_paths(scene: Scene, forward: Scene) -> None:
     model = model_of_trainer(build_trainer(CONFIG, scene))
     assert len(video_path(model, None, frames=3)) == 3
     turn = video_path(model, scene.train, frames=4, width=8)

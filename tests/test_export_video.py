@@ -1,4 +1,4 @@
-"""Pictures and films: what a mode shows, files that play, whole or not there."""
+"""Images and videos: what a mode shows, files that play, whole or not there."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from PIL import Image
 from gridreg.errors import InputError
 from gridreg.export.camera_paths import camera_path
 from gridreg.export.cameras import Camera, Lens
+from gridreg.export.images import colour_bar, depth_range, to_image
 from gridreg.export.model import Model
-from gridreg.export.pictures import colour_bar, depth_range, picture
 from gridreg.export.video import render_frames, render_video
 from gridreg.export.writers import write_video
 from gridreg.rendering import Rays, Rendered
@@ -47,7 +47,7 @@ def flat(value: float, opacity: float = 1.0, shape: tuple[int, int] = (4, 5)) ->
 
 
 def decoded(path: Path, height: int, width: int) -> tuple[np.ndarray, str]:
-    """All frames of a film, and what ffmpeg says about it."""
+    """All frames of a video, and what ffmpeg says about it."""
     program = imageio_ffmpeg.get_ffmpeg_exe()
     done = subprocess.run(
         [program, "-i", str(path), "-f", "rawvideo", "-pix_fmt", "rgb24", "-"],
@@ -58,13 +58,13 @@ def decoded(path: Path, height: int, width: int) -> tuple[np.ndarray, str]:
 
 
 class TestModel:
-    def test_picture_of_a_ball(self):
+    def test_image_of_a_ball(self):
         rendered = model_of().render(cameras_of(1)[0])
         assert rendered.colour.shape == (30, 40, 3)
         torch.testing.assert_close(rendered.colour[15, 20], RED, atol=1e-3, rtol=0)
         torch.testing.assert_close(rendered.colour[0, 0], torch.ones(3))
         assert float(rendered.depth[15, 20]) == pytest.approx(3.0 - 0.6, abs=0.03)
-        # The silhouette of a ball is a circle: its share of the picture is known.
+        # The silhouette of a ball is a circle: its share of the image is known.
         tangent = 0.6 / math.sqrt(3.0**2 - 0.6**2) * 1.2 * 40
         assert float(rendered.opacity.mean()) == pytest.approx(math.pi * tangent**2 / 1200, rel=0.05)
 
@@ -93,24 +93,28 @@ class TestModel:
             Model.of_field(AnalyticField(ball(0.6)), resolution=0)
 
 
-class TestPictures:
+class TestImages:
     def test_rgb_and_opacity_are_the_render(self):
         rendered = flat(2.0, opacity=0.25)
-        assert (picture(rendered, "rgb") == 128).all()
-        assert (picture(rendered, "opacity") == 64).all()
+        assert (to_image(rendered, "rgb") == 128).all()
+        assert (to_image(rendered, "opacity") == 64).all()
 
     def test_depth_goes_from_blue_to_red(self):
-        near, middle, far = (picture(flat(v), "depth", (1.0, 3.0))[0, 0].astype(int) for v in (1.0, 2.0, 3.0))
+        near, middle, far = (
+            to_image(flat(v), "depth", (1.0, 3.0))[0, 0].astype(int) for v in (1.0, 2.0, 3.0)
+        )
         assert near[2] > near[0]
         assert middle[1] > max(middle[0], middle[2])
         assert far[0] > far[2]
         # Half hit: half way to white.
-        half = picture(flat(3.0, opacity=0.5), "depth", (1.0, 3.0))[0, 0]
+        half = to_image(flat(3.0, opacity=0.5), "depth", (1.0, 3.0))[0, 0]
         np.testing.assert_allclose(half, (far + 255) / 2, atol=1)
-        assert (picture(flat(2.0, opacity=0.0), "depth", (1.0, 3.0)) == 255).all()
+        assert (to_image(flat(2.0, opacity=0.0), "depth", (1.0, 3.0)) == 255).all()
 
     def test_depth_is_where_the_ray_hits_not_scaled_by_opacity(self):
-        assert (picture(flat(2.0), "depth", (1.0, 3.0)) == picture(flat(2.0, 1.0), "depth", (1.0, 3.0))).all()
+        assert (
+            to_image(flat(2.0), "depth", (1.0, 3.0)) == to_image(flat(2.0, 1.0), "depth", (1.0, 3.0))
+        ).all()
         assert depth_range([flat(2.0, opacity=0.6), flat(4.0)]) == pytest.approx((2.0, 4.0), abs=0.15)
 
     def test_range_of_one_depth_and_of_nothing(self):
@@ -118,11 +122,11 @@ class TestPictures:
         assert near < 2.0 < far
         assert depth_range([flat(2.0, opacity=0.1)]) == (0.0, 1.0)
         assert depth_range([]) == (0.0, 1.0)
-        assert np.isfinite(picture(flat(0.0, opacity=0.0), "depth").astype(float)).all()
+        assert np.isfinite(to_image(flat(0.0, opacity=0.0), "depth").astype(float)).all()
 
     def test_unknown_mode(self):
         with pytest.raises(InputError, match="mode: found 'normals', expected one of rgb, depth, opacity"):
-            picture(flat(1.0), "normals")
+            to_image(flat(1.0), "normals")
 
     def test_bar_has_far_above_and_figures(self):
         bar = colour_bar(120, (1.0, 3.0))
@@ -151,7 +155,7 @@ class TestFrames:
         assert middle[2, 1] > 100
         assert 50 < middle[3, 0] < 200
 
-    def test_depth_has_one_scale_for_the_film_and_a_bar(self):
+    def test_depth_has_one_scale_for_the_video_and_a_bar(self):
         frames = list(render_frames(model_of(), cameras_of(3), modes=("depth",)))
         assert all(frame.shape == (30, 40 + 64, 3) for frame in frames)
         assert all(np.array_equal(frame[:, 40:], frames[0][:, 40:]) for frame in frames)
@@ -177,36 +181,36 @@ class TestFrames:
 
 class TestFiles:
     def test_mp4_plays_and_shows_the_object(self, tmp_path):
-        path = tmp_path / "new" / "film.mp4"
+        path = tmp_path / "new" / "video.mp4"
         told = []
         # Odd sizes are what H.264 does not take.
         cameras = cameras_of(5, size=(33, 41))
         render_video(model_of(), path, cameras, fps=12.5, progress=lambda *a: told.append(a))
-        film, told_by_ffmpeg = decoded(path, 34, 42)
-        assert film.shape == (5, 34, 42, 3)
-        assert film[2, 16, 20, 0] > 200
-        assert film[2, 16, 20, 1] < 60
-        assert (film[2, 1, 1] > 240).all()
+        video, told_by_ffmpeg = decoded(path, 34, 42)
+        assert video.shape == (5, 34, 42, 3)
+        assert video[2, 16, 20, 0] > 200
+        assert video[2, 16, 20, 1] < 60
+        assert (video[2, 1, 1] > 240).all()
         assert "h264" in told_by_ffmpeg
         assert "yuv420p" in told_by_ffmpeg
         assert "12.50 fps" in told_by_ffmpeg
         assert [(done, total) for done, total, _ in told] == [(i, 5) for i in range(1, 6)]
         assert told[-1][2] == 0
         assert all(left >= 0 for _, _, left in told)
-        assert [p.name for p in path.parent.iterdir()] == ["film.mp4"]
+        assert [p.name for p in path.parent.iterdir()] == ["video.mp4"]
 
-    def test_same_film_twice_is_the_same_file(self, tmp_path):
+    def test_same_video_twice_is_the_same_file(self, tmp_path):
         for name in ("a.mp4", "b.mp4"):
             render_video(model_of(), tmp_path / name, cameras_of(2))
         assert (tmp_path / "a.mp4").read_bytes() == (tmp_path / "b.mp4").read_bytes()
 
     def test_gif(self, tmp_path):
-        render_video(model_of(), tmp_path / "film.gif", cameras_of(4), fps=10)
-        with Image.open(tmp_path / "film.gif") as film:
-            assert film.n_frames in (1, 2, 3, 4)
-            assert film.info["duration"] % 100 == 0
-            assert film.info["loop"] == 0
-            pixel = film.convert("RGB").getpixel((20, 15))
+        render_video(model_of(), tmp_path / "video.gif", cameras_of(4), fps=10)
+        with Image.open(tmp_path / "video.gif") as video:
+            assert video.n_frames in (1, 2, 3, 4)
+            assert video.info["duration"] % 100 == 0
+            assert video.info["loop"] == 0
+            pixel = video.convert("RGB").getpixel((20, 15))
         assert pixel[0] > 200
         assert pixel[1] < 60
 
@@ -229,7 +233,7 @@ class TestFiles:
         path.write_text("x")
         return path
 
-    @pytest.mark.parametrize("name", ["film.mp4", "film.gif", "film"])
+    @pytest.mark.parametrize("name", ["video.mp4", "video.gif", "video"])
     def test_what_fails_half_way_leaves_what_stood_there(self, tmp_path, name):
         path = tmp_path / name
         frames = [np.zeros((8, 8, 3), np.uint8)] * 2
@@ -250,7 +254,7 @@ class TestFiles:
         return path.read_bytes() if path.is_file() else [p.read_bytes() for p in sorted(path.iterdir())]
 
     def test_no_frames(self, tmp_path):
-        for name in ("film.mp4", "film.gif"):
+        for name in ("video.mp4", "video.gif"):
             with pytest.raises(InputError, match="found no frames"):
                 write_video(tmp_path / name, [])
         assert list(tmp_path.iterdir()) == []
@@ -258,9 +262,9 @@ class TestFiles:
     def test_bad_targets_are_refused_before_rendering(self, tmp_path):
         model = model_of()
         for name, options, said in (
-            ("film.avi", {}, r"found suffix '\.avi', expected \.mp4, \.gif"),
-            ("film.mp4", {"fps": 0.0}, r"fps=0\.0"),
-            ("film.mp4", {"fps": math.nan}, "fps=nan"),
+            ("video.avi", {}, r"found suffix '\.avi', expected \.mp4, \.gif"),
+            ("video.mp4", {"fps": 0.0}, r"fps=0\.0"),
+            ("video.mp4", {"fps": math.nan}, "fps=nan"),
         ):
             with pytest.raises(InputError, match=said):
                 render_video(model, tmp_path / name, cameras_of(1), **options)

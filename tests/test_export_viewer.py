@@ -1,4 +1,4 @@
-"""The viewer's server side: addresses, cameras, and pictures for clients that a test plays."""
+"""The viewer's server side: addresses, cameras, and images for clients that a test plays."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ import pytest
 import torch
 
 from gridreg.errors import InputError
-from gridreg.export.browser import camera_of, picture_shape, start_server
+from gridreg.export.browser import camera_of, image_shape, start_server
 from gridreg.export.cameras import look_at
+from gridreg.export.images import z_depth
 from gridreg.export.model import Model
-from gridreg.export.pictures import z_depth
 from gridreg.export.viewer import Viewer
 from gridreg.rendering import Rendered, camera_rays
 from tests.export_fields import AnalyticField, ball, ball_model, ring_of_views
@@ -104,7 +104,7 @@ class TestServer:
 class TestCameras:
     def test_a_browser_sees_what_a_camera_sees(self):
         client = FakeClient(FRONT)
-        camera = camera_of(client, picture_shape(client, 512), 80)
+        camera = camera_of(client, image_shape(client, 512), 80)
         torch.testing.assert_close(camera.pose, FRONT, atol=1e-6, rtol=0)
         assert (camera.lens.height, camera.lens.width) == (60, 80)
         rays = camera_rays(camera.pose, torch.tensor(camera.lens.intrinsics), 60, 80)
@@ -115,11 +115,11 @@ class TestCameras:
         top = math.degrees(math.atan(float(rays.directions[40][2] / -rays.directions[40][0])))
         assert top == pytest.approx(25, abs=0.5)
 
-    def test_small_pictures_show_the_same(self):
+    def test_small_images_show_the_same(self):
         client = FakeClient(FRONT, size=(600, 800))
-        shape = picture_shape(client, 200)
+        shape = image_shape(client, 200)
         assert shape == (150, 200)
-        assert picture_shape(client, 1600) == (600, 800)
+        assert image_shape(client, 1600) == (600, 800)
         small = camera_of(client, shape, 50)
         fx, fy, cx, cy = small.lens.intrinsics
         assert (small.lens.height, small.lens.width) == (38, 50)
@@ -148,26 +148,24 @@ class TestDrawing:
     def test_sharpens_to_full_size_and_then_rests(self):
         viewer, client = self.start()
         with viewer:
-            until(lambda: client.pictures and client.pictures[-1].shape[:2] == (60, 80))
-            widths = [p.shape[1] for p in client.pictures]
+            until(lambda: client.images and client.images[-1].shape[:2] == (60, 80))
+            widths = [p.shape[1] for p in client.images]
             assert widths == sorted(widths)
-            middle = client.pictures[-1][30, 40].astype(int)
+            middle = client.images[-1][30, 40].astype(int)
             # The near side of the ball: x = 0.6, so red, and half of green and blue.
             assert middle == pytest.approx([0.8 * 255, 127, 127], abs=8)
-            assert (client.pictures[-1][0, 0] == 255).all()
-            count = len(client.pictures)
+            assert (client.images[-1][0, 0] == 255).all()
+            count = len(client.images)
             time.sleep(0.5)
-            assert len(client.pictures) == count
+            assert len(client.images) == count
 
     def test_follows_the_camera(self):
         viewer, client = self.start()
         with viewer:
-            until(lambda: client.pictures)
+            until(lambda: client.images)
             client.place(look_at(np.array([0.0, 3, 0]), np.zeros(3), np.array([0.0, 0, 1])))
             client.moved(client.camera)
-            found = until(
-                lambda: [p for p in client.pictures if p[p.shape[0] // 2, p.shape[1] // 2, 1] > 190]
-            )
+            found = until(lambda: [p for p in client.images if p[p.shape[0] // 2, p.shape[1] // 2, 1] > 190])
             assert found[-1][found[-1].shape[0] // 2, found[-1].shape[1] // 2, 0] < 140
 
     def test_training_is_shown_when_it_is_wanted(self):
@@ -178,12 +176,12 @@ class TestDrawing:
             assert not viewer.wants_update, "nobody looks"
             client = FakeClient(FRONT)
             viewer._connected(client)
-            until(lambda: client.pictures and viewer.wants_update)
-            assert client.pictures[-1].reshape(-1, 3)[:, 2].min() < 10
+            until(lambda: client.images and viewer.wants_update)
+            assert client.images[-1].reshape(-1, 3)[:, 2].min() < 10
             model.handle.step(100)
             viewer.update(model)
             assert not viewer.wants_update
-            until(lambda: client.pictures[-1].reshape(-1, 3)[:, 2].min() > 50)
+            until(lambda: client.images[-1].reshape(-1, 3)[:, 2].min() > 50)
             assert viewer._panel._step.value == 100
             viewer._disconnected(client)
             time.sleep(0.2)
@@ -193,7 +191,7 @@ class TestDrawing:
         broken = AnalyticField(ball(0.6))
         viewer, client = self.start(Model.of_field(broken, resolution=8))
         with viewer:
-            until(lambda: client.pictures)
+            until(lambda: client.images)
             failing = viewer._preview.at().field
 
             def fails(x: torch.Tensor) -> torch.Tensor:
@@ -204,11 +202,11 @@ class TestDrawing:
             until(lambda: "cannot draw" in viewer._panel._status.content)
             assert viewer._panel._status.content == "**cannot draw:** RuntimeError: no light"
             failing.function = ball(0.6)
-            count = len(client.pictures)
+            count = len(client.images)
             client.moved(client.camera)
-            until(lambda: len(client.pictures) > count)
+            until(lambda: len(client.images) > count)
 
-    def test_snapshot_is_the_full_picture_as_a_file(self):
+    def test_snapshot_is_the_full_image_as_a_file(self):
         import imageio.v3 as iio
 
         viewer, client = self.start()
@@ -231,7 +229,7 @@ class TestDrawing:
                 for client in clients:
                     client.moved(client.camera)
                 time.sleep(0.01)
-            counts = [len(client.pictures) for client in clients]
+            counts = [len(client.images) for client in clients]
         assert min(counts) >= 3
         assert max(counts) <= 2 * min(counts)
 

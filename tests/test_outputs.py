@@ -107,15 +107,15 @@ def test_rows_and_thumbnails():
     assert image_arrays.thumbnail(np.zeros((1, 1000, 3), np.uint8), 10).shape == (1, 10, 3)
 
 
-def test_depth_is_the_mean_distance_near_is_bright_and_nothing_is_white():
+def test_depth_is_the_mean_distance_near_is_blue_and_nothing_is_white():
     distance = torch.linspace(2, 6, 300)[None, :].expand(240, 300)
     opacity = torch.full((240, 300), 0.8)
     opacity[:120] = 0
     picture = outputs.depth_image(distance * opacity, opacity)[:, :300].astype(int)
     assert (picture[:120] == 255).all()
-    brightness = picture[200].sum(-1)
-    assert brightness[5] > brightness[150] > brightness[294]
-    scale = matplotlib.colormaps["viridis_r"]
+    redness = picture[200, :, 0] - picture[200, :, 2]
+    assert redness[5] < redness[150] < redness[294]
+    scale = matplotlib.colormaps["turbo"]
     # 4 world units stand in the middle of the scale, blended with white by the opacity.
     expected = 0.8 * np.array(scale(0.5)[:3]) * 255 + 0.2 * 255
     assert np.abs(picture[200, 150] - expected).max() <= 4

@@ -19,7 +19,7 @@ class ViewOptions:
     scene: OptionalFolder = None
     """Where the scene lies now, for its training cameras; default: where the run found it."""
     host: str = "127.0.0.1"
-    """Address to listen on; the default is reached from this machine only, 0.0.0.0 from the network."""
+    """Address to listen on; the default is reached from this machine only, 0.0.0.0 from the network with a token."""
     port: int = 8080
     """Port to listen on; 0: any free one."""
     size: int = 512

@@ -1,12 +1,12 @@
-"""What leaves the program: meshes, films, and a look at the field in a browser."""
+"""Meshes, videos, and a look at the field in a browser."""
 
 from gridreg.export.camera_files import load_cameras, save_cameras
 from gridreg.export.camera_paths import CAMERA_PATHS, camera_path, spiral, sway, tour, turntable
 from gridreg.export.cameras import Camera, Lens, Orbit, look_at, orbit_of_box, orbit_of_views
 from gridreg.export.compare import MeshComparison, compare_meshes
+from gridreg.export.images import MODES, to_image
 from gridreg.export.mesh import Mesh, extract_mesh, read_mesh, save_mesh, write_mesh
 from gridreg.export.model import Model
-from gridreg.export.pictures import MODES, picture
 from gridreg.export.runs import (
     LiveView,
     check_drawing,
@@ -43,7 +43,7 @@ __all__ = [
     "model_of_trainer",
     "orbit_of_box",
     "orbit_of_views",
-    "picture",
+    "to_image",
     "read_mesh",
     "render_frames",
     "render_video",

@@ -1,4 +1,4 @@
-"""Who may talk to the viewer's server, and what they may ask of it: every request and every message passes here."""
+"""Admission to the viewer's server: every request and every message passes here."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["LOOPBACK", "Admission"]
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 MOST_CLIENTS = 16
 MOST_BYTES = 1 << 16
-"""Of one message; a camera has a few hundred."""
+"""Size of one message; a camera has a few hundred."""
 MOST_PER_SECOND = 200
 """Messages that one browser may send; a camera in motion sends sixty."""
 LARGEST_WINDOW = 8192

@@ -1,4 +1,4 @@
-"""What the viewer needs of viser: a server, the cameras of browsers, training cameras to look at."""
+"""The viewer's side of viser: a server, the cameras of browsers, training cameras to look at."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from gridreg.export._admission import Admission
 from gridreg.export.cameras import Camera, Lens
 from gridreg.scenes import Views
 
-__all__ = ["add_frustums", "camera_of", "check_address", "picture_shape", "quiet_console", "start_server"]
+__all__ = ["add_frustums", "camera_of", "check_address", "image_shape", "quiet_console", "start_server"]
 
 # The browser's cameras look along +z with y down (OpenCV).
 _FLIP = np.diag([1.0, -1.0, -1.0])
@@ -90,15 +90,15 @@ def start_server(host: str, port: int, admission: Admission | None = None) -> An
     return server
 
 
-def picture_shape(client: Any, size: int) -> tuple[int, int]:
-    """Height and width at rest of a client's picture: no more pixels than its window has."""
+def image_shape(client: Any, size: int) -> tuple[int, int]:
+    """Height and width at rest of a client's image: no more pixels than its window has."""
     height, width = max(1, client.camera.image_height), max(1, client.camera.image_width)
     factor = min(1.0, size / max(height, width))
     return max(1, round(height * factor)), max(1, round(width * factor))
 
 
 def camera_of(client: Any, shape: tuple[int, int], width: int) -> Camera:
-    """The camera of a browser's window, for a picture of a width."""
+    """The camera of a browser's window, for an image of a width."""
     camera = client.camera
     height = max(1, round(shape[0] * width / shape[1]))
     w, x, y, z = (float(v) for v in camera.wxyz)
@@ -111,11 +111,11 @@ def camera_of(client: Any, shape: tuple[int, int], width: int) -> Camera:
 
 
 def add_frustums(server: Any, views: Views, background: Tensor, depth: float) -> None:
-    """The cameras of views with their pictures ``depth`` world units before them; a click goes there."""
-    pictures = (views.composited(background.cpu()) * 255).round().to(torch.uint8).cpu().numpy()
+    """The cameras of views with their images ``depth`` world units before them; a click goes there."""
+    images = (views.composited(background.cpu()) * 255).round().to(torch.uint8).cpu().numpy()
     stride = max(1, math.ceil(len(views) / _MOST_FRUSTUMS))
     for i in range(0, len(views), stride):
-        small = Image.fromarray(pictures[i])
+        small = Image.fromarray(images[i])
         small.thumbnail((128, 128))
         pose = views.poses[i].double().cpu().numpy()
         x, y, z, w = Rotation.from_matrix(pose[:3, :3] @ _FLIP).as_quat()

@@ -1,4 +1,4 @@
-"""Camera paths as files: a JSON frame list as NeRF programs write it, without pictures."""
+"""Camera paths as files: a JSON frame list as NeRF programs write it, without images."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def save_cameras(path: str | Path, cameras: Sequence[Camera]) -> None:
 
 
 def load_cameras(path: str | Path, lens: Lens | None = None) -> list[Camera]:
-    """Read a camera file: what `save_cameras` writes, or any ``transforms.json`` (without its pictures).
+    """Read a camera file: what `save_cameras` writes, or any ``transforms.json`` (without its images).
 
     Every frame has a ``transform_matrix``. The lens (``fl_x``, or ``camera_angle_x`` in radians; optionally
     ``fl_y``, ``cx``, ``cy``; ``w``, ``h``) is taken from the frame, else from the top of the file, else from

@@ -41,16 +41,16 @@ def camera_path(
     elevation: float | None = None,
     radius: float | None = None,
 ) -> list[Camera]:
-    """The cameras of a film by name.
+    """The cameras of a video by name.
 
     Args:
         name: "turntable", "spiral", "train" (through the training cameras), or a JSON file, see
             `load_cameras`.
         bounds: ``(2, 3)`` box of the field, world units.
         views: the training views, which say where up is, how far away to stand and through which lens to
-            look. Without them z is up, the box fits into the picture, and there is no "train".
-        frames: number of pictures; a file has its own.
-        width: of the pictures, pixels; None: that of the views, or 400.
+            look. Without them z is up, the box fits into the image, and there is no "train".
+        frames: number of images; a file has its own.
+        width: of the images, pixels; None: that of the views, or 400.
         elevation: of the turntable, degrees; None: the median of the views'.
         radius: of turntable and spiral, world units; None: the median of the views'.
 
@@ -113,18 +113,18 @@ def spiral(orbit: Orbit, lens: Lens, frames: int = 240, turns: int = 2) -> list[
         InputError: for less than one frame.
     """
     _check_frames(frames)
-    # Over a pole the picture would turn around.
+    # Over a pole the image would turn around.
     low, high = (max(-75.0, min(75.0, e)) for e in orbit.elevations)
-    shares = [i / frames for i in range(frames)]
-    rise = [(1 - math.cos(2 * math.pi * share)) / 2 for share in shares]
+    angles = [2 * math.pi * i / frames for i in range(frames)]
+    rises = [(1 - math.cos(angle)) / 2 for angle in angles]
     return [
-        Camera(orbit.pose(360 * turns * share, low + (high - low) * r), lens)
-        for share, r in zip(shares, rise, strict=True)
+        Camera(orbit.pose(math.degrees(turns * angle), low + (high - low) * rise), lens)
+        for angle, rise in zip(angles, rises, strict=True)
     ]
 
 
 def forward_facing(views: Views) -> bool:
-    """Whether all cameras look the same way, to within 60 degrees of their mean direction."""
+    """Return True if all cameras look the same way, to within 60 degrees of their mean direction."""
     axes = -views.poses[:, :3, 2].double().cpu().numpy()
     mean = axes.mean(axis=0)
     return bool((axes @ mean > 0.5 * np.linalg.norm(mean)).all() and np.linalg.norm(mean) > 0.5)

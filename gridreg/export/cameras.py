@@ -21,7 +21,7 @@ Vector = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Lens:
-    """Intrinsics and size of a picture.
+    """Intrinsics and size of an image.
 
     Args:
         intrinsics: fx, fy, cx, cy in pixels.
@@ -42,7 +42,7 @@ class Lens:
 
     @classmethod
     def from_angle(cls, degrees: float, height: int, width: int) -> Lens:
-        """A lens with a horizontal field of view, its axis through the middle of the picture.
+        """A lens with a horizontal field of view, its axis through the middle of the image.
 
         Example:
             >>> Lens.from_angle(90.0, 100, 200).intrinsics
@@ -60,7 +60,7 @@ class Lens:
         return cls((fx, fy, cx, cy), views.height, views.width)
 
     def resized(self, width: int) -> Lens:
-        """The same view in a picture of another width; the height follows."""
+        """The same view in an image of another width; the height follows."""
         factor = width / self.width
         fx, fy, cx, cy = self.intrinsics
         height = max(1, round(self.height * factor))
@@ -73,7 +73,7 @@ class Camera:
     """A lens at a place.
 
     Args:
-        pose: camera-to-world ``(4, 4)`` float32, looking along -z with y up in the picture.
+        pose: camera-to-world ``(4, 4)`` float32, looking along -z with y up in the image.
         lens: intrinsics and size.
     """
 
@@ -86,7 +86,7 @@ def look_at(position: Vector, target: Vector, up: Vector) -> Tensor:
 
     Args:
         position, target: ``(3,)``, world units, different.
-        up: ``(3,)``; the picture's upper edge points that way. Looking along it, any side is up.
+        up: ``(3,)``; the image's upper edge points that way. Looking along it, any side is up.
 
     Raises:
         InputError: if both points are the same.
@@ -174,7 +174,7 @@ def orbit_of_views(views: Views, bounds: Tensor | None = None) -> Orbit:
     away = poses[:, :3, 3] - centre
     distances = np.linalg.norm(away, axis=1)
     elevations = np.degrees(np.arcsin(np.clip(away @ up / np.maximum(distances, 1e-9), -1, 1)))
-    # Straight from above or below a turntable only spins the picture.
+    # Straight from above or below a turntable only spins the image.
     elevation = float(np.clip(np.median(elevations), -60, 60))
     span = (float(elevations.min()), float(elevations.max()))
     return Orbit(centre, up, _level(away[0], up), float(np.median(distances)), elevation, span)

@@ -1,4 +1,4 @@
-"""How far a mesh is from the truth: Chamfer distance, F-score, normal consistency."""
+"""Distances of a mesh to the true one: Chamfer distance, F-score, normal consistency."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 import torch
+import trimesh.sample
 from numpy.typing import NDArray
 from scipy.spatial import KDTree  # type: ignore[import-untyped]
 
 from gridreg.errors import InputError
-from gridreg.export.marching import face_areas
 from gridreg.export.mesh import Mesh
 
 __all__ = ["MeshComparison", "compare_meshes", "sample_surface"]
@@ -29,14 +29,14 @@ class MeshComparison:
         chamfer: mean of accuracy and completeness, world units.
         accuracy: mean distance from the mesh to the truth, world units.
         completeness: mean distance from the truth to the mesh, world units.
-        precision: share of the mesh within ``threshold`` of the truth.
-        recall: share of the truth within ``threshold`` of the mesh.
+        precision: fraction of the mesh within ``threshold`` of the truth.
+        recall: fraction of the truth within ``threshold`` of the mesh.
         f_score: harmonic mean of both (Knapitsch et al., Tanks and Temples, 2017).
         normal_consistency: mean absolute cosine between the normals of a point and of the point nearest to it
             on the other surface, over both directions (Mescheder et al., Occupancy Networks, 2019).
         threshold: of precision and recall, world units.
         diagonal: of the truth's bounding box, world units.
-        chamfer_relative: chamfer as a share of the diagonal.
+        chamfer_relative: chamfer over the diagonal.
         accuracy_relative: likewise.
         completeness_relative: likewise.
     """
@@ -60,13 +60,13 @@ class MeshComparison:
 
     def __str__(self) -> str:
         """Six lines for a terminal."""
-        share = self.threshold / self.diagonal
+        fraction = self.threshold / self.diagonal
         return "\n".join(
             [
                 f"Chamfer distance    {self.chamfer:.5g} ({self.chamfer_relative:.3%} of the box diagonal)",
                 f"  mesh to truth     {self.accuracy:.5g} ({self.accuracy_relative:.3%})",
                 f"  truth to mesh     {self.completeness:.5g} ({self.completeness_relative:.3%})",
-                f"F-score             {self.f_score:.4f} within {self.threshold:.4g} ({share:.2%})",
+                f"F-score             {self.f_score:.4f} within {self.threshold:.4g} ({fraction:.2%})",
                 f"  precision, recall {self.precision:.4f}, {self.recall:.4f}",
                 f"Normal consistency  {self.normal_consistency:.4f}",
             ]
@@ -74,7 +74,7 @@ class MeshComparison:
 
 
 def sample_surface(mesh: Mesh, count: int, generator: torch.Generator) -> tuple[Points, NDArray[np.int64]]:
-    """Points spread evenly by area over a mesh, and the face of each.
+    """Return points spread evenly by area over a mesh, and the face of each.
 
     Args:
         mesh: with some area.
@@ -89,33 +89,32 @@ def sample_surface(mesh: Mesh, count: int, generator: torch.Generator) -> tuple[
     """
     if count < 1:
         raise InputError(f"samples={count}: expected at least 1 point")
-    edges = np.cumsum(face_areas(mesh.vertices, mesh.faces))
-    if not len(edges) or not 0 < edges[-1] < np.inf:
-        raise InputError(f"mesh: found {len(edges)} faces without area, expected a surface")
-    draws = torch.rand((count, 3), generator=generator, dtype=torch.float64).numpy()
-    face = np.searchsorted(edges, draws[:, 0] * edges[-1], side="right").clip(max=len(edges) - 1)
-    # Folding the unit square over its diagonal makes it a triangle.
-    u, v = draws[:, 1], draws[:, 2]
-    outside = u + v > 1
-    u, v = np.where(outside, 1 - u, u)[:, None], np.where(outside, 1 - v, v)[:, None]
-    a, b, c = (mesh.vertices[mesh.faces[face, k]] for k in range(3))
-    return a + u * (b - a) + v * (c - a), face.astype(np.int64)
+    area = float(mesh.to_trimesh().area) if len(mesh.faces) else 0.0
+    if not 0 < area < np.inf:
+        raise InputError(f"mesh: found {len(mesh.faces)} faces without area, expected a surface")
+    seed = int(torch.randint(1 << 31, (), generator=generator))
+    points, faces = trimesh.sample.sample_surface(mesh.to_trimesh(), count, seed=seed)
+    return np.asarray(points), np.asarray(faces, dtype=np.int64)
 
 
 def _unit_normals(mesh: Mesh) -> Points:
-    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
-    normals = np.cross(b - a, c - a)
-    length: Points = np.linalg.norm(normals, axis=1, keepdims=True)
-    return np.asarray(normals / np.maximum(length, np.finfo(np.float64).tiny))
+    """Return the normals ``(F, 3)`` of the faces; zero for a face without area."""
+    a, b, c = (mesh.corners[:, k] for k in range(3))
+    crosses = np.cross(b - a, c - a)
+    length = np.linalg.norm(crosses, axis=1, keepdims=True)
+    return np.asarray(crosses / np.maximum(length, np.finfo(np.float64).tiny))
 
 
-def _to_triangles(points: Points, triangles: Points) -> Points:
-    """Distance ``(N,)`` of each point ``(N, 3)`` to its own triangle ``(N, 3, 3)``, at any scale."""
+def _to_triangles(points: Points, corners: Points) -> Points:
+    """Return the distance ``(N,)`` of each point ``(N, 3)`` to its own triangle ``(N, 3, 3)``, at any scale.
+
+    trimesh's ``closest_point`` calls short edges zero, so it is off for small objects.
+    """
     tiny = np.finfo(np.float64).tiny
-    following = np.roll(triangles, -1, axis=1)
-    edges, away = following - triangles, points[:, None] - triangles
-    share = (away * edges).sum(axis=-1) / np.maximum((edges * edges).sum(axis=-1), tiny)
-    to_edges = np.linalg.norm(away - np.clip(share, 0, 1)[..., None] * edges, axis=-1).min(axis=1)
+    following = np.roll(corners, -1, axis=1)
+    edges, away = following - corners, points[:, None] - corners
+    along = (away * edges).sum(axis=-1) / np.maximum((edges * edges).sum(axis=-1), tiny)
+    to_edges = np.linalg.norm(away - np.clip(along, 0, 1)[..., None] * edges, axis=-1).min(axis=1)
     normal = np.cross(edges[:, 0], edges[:, 1])
     length = np.linalg.norm(normal, axis=-1)
     above = (np.cross(edges, away) * normal[:, None]).sum(axis=-1) >= 0
@@ -127,19 +126,19 @@ def _to_triangles(points: Points, triangles: Points) -> Points:
 def _nearest(
     points: Points, mesh: Mesh, samples: Points, faces: NDArray[np.int64]
 ) -> tuple[Points, NDArray[np.int64]]:
-    """Distance ``(N,)`` of points to a mesh, and the nearest face of each.
+    """Return the distance ``(N,)`` of points to a mesh, and the nearest face of each.
 
     The distance to the nearest sample alone would be too large by about half the spacing of the samples. So
     samples (large triangles have many) and centroids (small ones may have no sample) only mark the triangles
     to be measured.
     """
-    marks = np.concatenate([samples, mesh.vertices[mesh.faces].mean(axis=1)])
+    marks = np.concatenate([samples, mesh.corners.mean(axis=1)])
     faces = np.concatenate([faces, np.arange(len(mesh.faces))])
     _, near = KDTree(marks).query(points, k=[*range(1, min(_CANDIDATES, len(marks)) + 1)])
     best = np.full(len(points), np.inf)
     face = np.zeros(len(points), np.int64)
     for candidate in faces[near].T:
-        distance = _to_triangles(points, mesh.vertices[mesh.faces[candidate]])
+        distance = _to_triangles(points, mesh.corners[candidate])
         closer = distance < best
         best, face = np.where(closer, distance, best), np.where(closer, candidate, face)
     return best, face

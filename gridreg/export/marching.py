@@ -5,19 +5,20 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 from scipy import ndimage, sparse  # type: ignore[import-untyped]
 from skimage.measure import marching_cubes
 
 from gridreg.export.volume import DensityVolume
 
-__all__ = ["drop_small_components", "face_areas", "polygonise", "vertex_normals"]
+__all__ = ["drop_small_components", "polygonise", "vertex_normals"]
 
 Vertices = NDArray[np.float64]
 Faces = NDArray[np.int64]
 Density = Callable[[Vertices], NDArray[np.float32]]
 
-# Vertices keep this share of an edge away from its ends: closer, neighbouring vertices would fall together.
+# Vertices keep this fraction of an edge away from its ends: closer, neighbouring vertices would fall together.
 _MARGIN = 0.02
 
 
@@ -42,7 +43,7 @@ def polygonise(
         threshold: density per world unit, above 0.
         density: world positions ``(N, 3)`` to densities ``(N,)``, 0 outside the box; None: no bisection.
         refine: bisection steps; the vertices are then within ``2**-(refine + 1)`` of a lattice edge, but for
-            the share of 0.02 that they keep from its ends.
+            the fraction of 0.02 that they keep from its ends.
         fill_cavities: leave out surfaces that are closed off from the outside.
 
     Returns:
@@ -100,21 +101,10 @@ def _on_level(
     return result
 
 
-def _area_vectors(vertices: Vertices, faces: Faces) -> Vertices:
-    """Outward normals of the faces ``(F, 3)``, as long as twice their areas."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    return np.cross(b - a, c - a)
-
-
-def face_areas(vertices: Vertices, faces: Faces) -> NDArray[np.float64]:
-    """Area of every face ``(F,)``, square world units."""
-    areas: NDArray[np.float64] = np.linalg.norm(_area_vectors(vertices, faces), axis=1) / 2
-    return areas
-
-
 def vertex_normals(vertices: Vertices, faces: Faces) -> Vertices:
-    """Outward unit normals ``(V, 3)``: those of the faces around each vertex, weighted by area."""
-    of_faces = _area_vectors(vertices, faces)
+    """Return outward unit normals ``(V, 3)``: those of the faces around each vertex, weighted by area."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    of_faces = np.cross(b - a, c - a)
     total: Vertices = np.zeros_like(vertices)
     for corner in range(3):
         for axis in range(3):
@@ -125,18 +115,18 @@ def vertex_normals(vertices: Vertices, faces: Faces) -> Vertices:
     return total
 
 
-def drop_small_components(vertices: Vertices, faces: Faces, share: float) -> tuple[Vertices, Faces]:
-    """Keep the connected parts whose surface is at least ``share`` of the surface of the largest part.
+def drop_small_components(vertices: Vertices, faces: Faces, least: float) -> tuple[Vertices, Faces]:
+    """Keep the connected parts whose surface is at least ``least`` of the surface of the largest part.
 
     Args:
         vertices, faces: the mesh; at least one face.
-        share: in [0, 1]; 0 keeps everything, 1 the largest part alone.
+        least: in [0, 1]; 0 keeps everything, 1 the largest part alone.
     """
     pairs = np.concatenate([faces[:, :2], faces[:, 1:]])
     graph = sparse.coo_matrix((np.ones(len(pairs), np.int8), pairs.T), shape=(len(vertices), len(vertices)))
     _, part_of_vertex = sparse.csgraph.connected_components(graph, directed=False)
     part = part_of_vertex[faces[:, 0]]
-    surface = np.bincount(part, face_areas(vertices, faces))
-    kept = faces[(surface >= share * surface.max())[part]]
+    surface = np.bincount(part, trimesh.Trimesh(vertices, faces, process=False).area_faces)
+    kept = faces[(surface >= least * surface.max())[part]]
     used, renumbered = np.unique(kept, return_inverse=True)
     return vertices[used], renumbered.reshape(-1, 3).astype(np.int64)

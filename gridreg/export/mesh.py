@@ -8,10 +8,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
+import trimesh
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -21,9 +22,6 @@ from gridreg.export.volume import SeenDensity, sample_density, surface_threshold
 from gridreg.rendering import Field, OccupancyGrid
 from gridreg.segments import optical_depth_to_weights
 from gridreg.training.files import check_output_folder, writing
-
-if TYPE_CHECKING:
-    import trimesh
 
 __all__ = ["MESH_SUFFIXES", "Mesh", "extract_mesh", "read_mesh", "save_mesh", "write_mesh"]
 
@@ -53,6 +51,11 @@ class Mesh:
     threshold: float | None = None
 
     @property
+    def corners(self) -> Vertices:
+        """Corners of every face ``(F, 3, 3)``, world units."""
+        return np.asarray(self.vertices[self.faces])
+
+    @property
     def volume(self) -> float:
         """Signed volume, cubic world units: positive when the faces of a closed mesh look outward.
 
@@ -62,21 +65,16 @@ class Mesh:
             >>> round(6 * tetrahedron.volume, 12)
             1.0
         """
-        a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
-        return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
+        return float(self.to_trimesh().volume)
 
     @property
     def watertight(self) -> bool:
-        """Whether every edge joins exactly two faces, which run along it in opposite directions."""
-        directed = np.concatenate([self.faces[:, [0, 1]], self.faces[:, [1, 2]], self.faces[:, [2, 0]]])
-        forwards, counts = np.unique(directed, axis=0, return_counts=True)
-        backwards = np.unique(directed[:, ::-1], axis=0)
-        return bool((counts == 1).all()) and np.array_equal(forwards, backwards)
+        """True if every edge joins exactly two faces, which run along it in opposite directions."""
+        mesh = self.to_trimesh()
+        return bool(mesh.is_watertight and mesh.is_winding_consistent)
 
     def to_trimesh(self) -> trimesh.Trimesh:
-        """The same mesh for the trimesh library; nothing is merged or reordered."""
-        import trimesh
-
+        """Return the same mesh for the trimesh library; nothing is merged or reordered."""
         return trimesh.Trimesh(self.vertices, self.faces, vertex_colors=self.colours, process=False)
 
 
@@ -106,7 +104,7 @@ def extract_mesh(
             `gridreg.export.volume.surface_threshold`.
         bounds: ``(2, 3)`` box to look in, world units; None: that of the field.
         colours: whether to colour the vertices, as the field is seen along the inward normal.
-        min_component: parts with less surface than this share of that of the largest part are dropped.
+        min_component: parts with less surface than this fraction of that of the largest part are dropped.
         fill_cavities: leave out surfaces that cannot be reached from outside. What a field holds inside a
             solid was never seen by any camera.
         refine: bisection steps that move the vertices onto the level set.
@@ -118,7 +116,7 @@ def extract_mesh(
     if threshold is not None and not 0 < threshold < float("inf"):
         raise InputError(f"threshold={threshold}: expected a density per world unit above 0")
     if not 0 <= min_component <= 1:
-        raise InputError(f"min_component={min_component}: expected a share in [0, 1]")
+        raise InputError(f"min_component={min_component}: expected a fraction in [0, 1]")
     if refine < 0:
         raise InputError(f"refine={refine}: expected a number of bisection steps, at least 0")
     density = SeenDensity(field, occupancy, chunk)
@@ -231,8 +229,6 @@ def read_mesh(path: str | Path) -> Mesh:
         InputError: for another suffix than `READABLE`, or if there is no such file, it is not a mesh, it holds no
             faces, or a face names a corner that is not there.
     """
-    import trimesh
-
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such mesh file")

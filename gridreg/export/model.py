@@ -63,12 +63,12 @@ class Model:
     def render(
         self, camera: Camera, *, chunk: int = 1 << 14, stop: Callable[[], bool] | None = None
     ) -> Rendered | None:
-        """A picture; the result does not depend on ``chunk``.
+        """An image; the result does not depend on ``chunk``.
 
         Args:
             camera: from where.
             chunk: rays at once.
-            stop: asked between chunks; True gives the picture up.
+            stop: asked between chunks; True gives the image up.
 
         Returns:
             colour ``(H, W, 3)`` in [0, 1], opacity and depth ``(H, W)``, or None if it was given up.
@@ -93,5 +93,5 @@ class Model:
 
     def _render(self, rays: Rays) -> Rendered:
         rendered = render_rays(self.field, rays, self.occupancy, self.march, background=self.background)
-        # The samples would be kept for the whole picture.
+        # The samples would be kept for the whole image.
         return Rendered(rendered.colour, rendered.opacity, rendered.depth)

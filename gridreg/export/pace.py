@@ -1,4 +1,4 @@
-"""How many pixels to draw: few while something moves, all of them at rest."""
+"""Widths of the next images: few pixels while something moves, all of them at rest."""
 
 from __future__ import annotations
 
@@ -8,25 +8,25 @@ __all__ = ["Pace"]
 
 
 class Pace:
-    """Follows how long rays take and says how wide the next picture should be.
+    """Follows how long rays take and says how wide the next image should be.
 
     Args:
-        seconds: what a picture may take while the camera moves.
+        seconds: what an image may take while the camera moves.
         smallest: width below which it does not go, pixels.
     """
 
     def __init__(self, seconds: float = 0.12, smallest: int = 48) -> None:
         self.seconds, self.smallest = seconds, smallest
-        # About what two cores do; the first picture corrects it.
+        # About what two cores do; the first image corrects it.
         self._per_ray = 1e-5
 
     def saw(self, rays: int, seconds: float) -> None:
-        """Tell how long a picture took."""
+        """Tell how long an image took."""
         if rays > 0:
             self._per_ray += 0.5 * (seconds / rays - self._per_ray)
 
     def moving(self, full: int, aspect: float) -> int:
-        """Width of a picture that can be drawn in time, at most ``full``, pixels.
+        """Width of an image that can be drawn in time, at most ``full``, pixels.
 
         Args:
             full: width at rest, pixels.

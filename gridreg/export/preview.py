@@ -56,7 +56,7 @@ class Preview:
 
     @property
     def warped(self) -> bool:
-        """Whether rays are mapped before they are walked, see `Model`."""
+        """True if rays are mapped before they are marched, see `Model`."""
         return self._model.warp is not None
 
     def at(self, step: int | None = None, off: Collection[str] = ()) -> Model:

@@ -1,4 +1,4 @@
-"""Runs and what can be held and shown of them: models, a mesh, a film, and a look while they are under way."""
+"""Runs and what can be held and shown of them: models, a mesh, a video, and a look while they are under way."""
 
 from __future__ import annotations
 
@@ -47,10 +47,10 @@ def model_of_trainer(trainer: Trainer) -> Model:
 def video_path(
     model: Model, views: Views | None = None, path: str | Path | None = None, **options: Any
 ) -> list[Camera]:
-    """Cameras for a film of a model, as `camera_path` gives them.
+    """Cameras for a video of a model, as `camera_path` gives them.
 
     Args:
-        model: what to film.
+        model: what to video.
         views: the training views.
         path: name or camera file; None: a turntable, or for a forward-facing scene a spiral.
         options: further arguments of `camera_path`.
@@ -73,7 +73,7 @@ def check_drawing(*, video: bool = True) -> None:
     """Say before a training what `draw_run` would say after it.
 
     Raises:
-        InputError: if a film is wanted and there is no ffmpeg.
+        InputError: if a video is wanted and there is no ffmpeg.
     """
     if video:
         try:
@@ -90,7 +90,7 @@ def draw_run(run: Execution, *, mesh: bool = True, video: bool = True) -> list[P
     Args:
         run: trained to its end.
         mesh: write the mesh.
-        video: write the film.
+        video: write the video.
 
     Returns:
         What was written.

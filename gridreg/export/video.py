@@ -1,4 +1,4 @@
-"""Films of fields: MP4, GIF, or a folder of PNG frames."""
+"""Videos of fields: MP4, GIF, or a folder of PNG frames."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy as np
 
 from gridreg.errors import InputError
 from gridreg.export.cameras import Camera
+from gridreg.export.images import DepthRange, check_mode, colour_bar, depth_range, to_image
 from gridreg.export.model import Model
-from gridreg.export.pictures import DepthRange, check_mode, colour_bar, depth_range, picture
 from gridreg.export.writers import check_target, write_video
 from gridreg.rendering import Rendered
 from gridreg.training.images import ImageArray, row
@@ -32,15 +32,15 @@ def render_video(
     depths: DepthRange | None = None,
     progress: Progress | None = None,
 ) -> None:
-    """Film a field, or several fields side by side, along a path of cameras.
+    """Render a video of a field, or several fields side by side, along a path of cameras.
 
     Args:
-        models: what to film; several lie side by side, in this order.
+        models: what to video; several lie side by side, in this order.
         path: ``.mp4`` (H.264), ``.gif`` (colours reduced to 256 a frame, delays in hundredths of a second),
             or a name without suffix: a folder of PNG frames.
         cameras: one for each frame, all of one size.
-        modes: what to show of each model, side by side; see `gridreg.export.pictures.MODES`. Depth has one
-            scale for the whole film, shown at the right.
+        modes: what to show of each model, side by side; see `gridreg.export.images.MODES`. Depth has one
+            scale for the whole video, shown at the right.
         fps: frames per second.
         depths: near and far end of the depth scale, world units; None: from some of the frames.
         progress: told after every frame.
@@ -70,13 +70,13 @@ def render_frames(
         check_mode(mode)
     if not cameras or not shown or not modes:
         raise InputError(
-            f"film: found {len(cameras)} cameras, {len(shown)} models, {len(modes)} modes, expected some"
+            f"video: found {len(cameras)} cameras, {len(shown)} models, {len(modes)} modes, expected some"
         )
     sizes = sorted({(camera.lens.width, camera.lens.height) for camera in cameras})
     if len(sizes) > 1:
         raise InputError(f"cameras: found the sizes {sizes[0]} and {sizes[1]}, expected one for all frames")
     if "depth" in modes and depths is None:
-        depths = _film_depths(shown, cameras)
+        depths = _common_depths(shown, cameras)
     return _frames(shown, cameras, modes, depths)
 
 
@@ -84,7 +84,7 @@ def _frames(
     models: Sequence[Model], cameras: Sequence[Camera], modes: Sequence[str], depths: DepthRange | None
 ) -> Iterator[ImageArray]:
     for camera in cameras:
-        parts = [picture(render, mode, depths) for render in _renders(models, camera) for mode in modes]
+        parts = [to_image(render, mode, depths) for render in _renders(models, camera) for mode in modes]
         if "depth" in modes and depths is not None:
             parts.append(colour_bar(camera.lens.height, depths))
         yield row(parts, gap=0)
@@ -95,8 +95,8 @@ def _renders(models: Sequence[Model], camera: Camera) -> list[Rendered]:
     return [render for render in renders if render is not None]
 
 
-def _film_depths(models: Sequence[Model], cameras: Sequence[Camera], looks: int = 8) -> DepthRange:
-    """One scale for all frames, from small pictures of some of them."""
+def _common_depths(models: Sequence[Model], cameras: Sequence[Camera], looks: int = 8) -> DepthRange:
+    """One scale for all frames, from small images of some of them."""
     chosen = [cameras[i] for i in sorted({round(x) for x in np.linspace(0, len(cameras) - 1, looks)})]
     small = [Camera(c.pose, c.lens.resized(min(64, c.lens.width))) for c in chosen]
     return depth_range([render for camera in small for render in _renders(models, camera)])

@@ -14,11 +14,11 @@ from PIL import Image
 from torch import Tensor
 
 from gridreg.export._admission import Admission
-from gridreg.export.browser import add_frustums, camera_of, picture_shape, quiet_console, start_server
+from gridreg.export.browser import add_frustums, camera_of, image_shape, quiet_console, start_server
 from gridreg.export.cameras import Camera, orbit_of_box, orbit_of_views
+from gridreg.export.images import colour_bar, depth_range, to_image, z_depth
 from gridreg.export.model import Model
 from gridreg.export.pace import Pace
-from gridreg.export.pictures import colour_bar, depth_range, picture, z_depth
 from gridreg.export.preview import Preview
 from gridreg.export.viewer_panel import Look, Panel
 from gridreg.rendering import Rendered
@@ -27,7 +27,7 @@ from gridreg.training.images import ImageArray
 
 __all__ = ["Viewer"]
 
-# Seconds without movement after which the picture is sharpened.
+# Seconds without movement after which the image is sharpened.
 _REST = 0.25
 
 
@@ -44,10 +44,10 @@ class Viewer:
 
     Args:
         model: what to show first.
-        views: training views, drawn as cameras with their pictures; they also say where up is.
+        views: training views, drawn as cameras with their images; they also say where up is.
         host: address to listen on; 127.0.0.1 is reached from this machine alone.
         port: 0: any free one.
-        size: longer edge of the picture at rest, pixels; can be changed in the page.
+        size: longer edge of the image at rest, pixels; can be changed in the page.
         refresh: least time between two copies of a field in training, seconds.
         quiet: do not say on standard error where the page is.
 
@@ -97,7 +97,7 @@ class Viewer:
 
     @property
     def wants_update(self) -> bool:
-        """Whether somebody looks and the copy is old; cheap enough to ask at every iteration."""
+        """True if somebody looks and the copy is old; cheap enough to ask at every iteration."""
         return bool(self._screens) and time.monotonic() - self._updated > self._refresh
 
     def update(self, model: Model) -> None:
@@ -125,7 +125,7 @@ class Viewer:
 
     @property
     def watched(self) -> bool:
-        """Whether a browser shows the page."""
+        """True while a browser shows the page."""
         return bool(self._screens)
 
     def wait(self, *, watched: bool = False) -> None:
@@ -233,13 +233,13 @@ class Viewer:
     def _draw(self, screen: _Screen) -> None:
         wanted, look = screen.wanted, self._panel.look
         screen.served = time.monotonic()
-        shape = picture_shape(screen.client, look.size)
+        shape = image_shape(screen.client, look.size)
         if screen.drawn != wanted:
             width = self._pace.moving(shape[1], shape[1] / shape[0])
         else:
             width = self._pace.sharper(screen.width, shape[1])
         camera = camera_of(screen.client, shape, width)
-        # A first picture is always finished: something must be seen during a long movement.
+        # A first image is always finished: something must be seen during a long movement.
         first = screen.drawn != wanted
         start = time.monotonic()
         rendered = self._render(camera, look, None if first else screen, wanted)
@@ -263,9 +263,9 @@ class Viewer:
         return self._preview.at(look.step, look.off).render(camera, chunk=1 << 13, stop=given_up)
 
     def _save(self, client: Any) -> None:
-        """Send the picture that a client sees, at full resolution, as a file."""
+        """Send the image that a client sees, at full resolution, as a file."""
         look = self._panel.look
-        shape = picture_shape(client, look.size)
+        shape = image_shape(client, look.size)
         rendered = self._render(camera_of(client, shape, shape[1]), look, None, 0)
         if rendered is not None:
             file = io.BytesIO()
@@ -275,7 +275,7 @@ class Viewer:
 
 
 class _Screen:
-    """What one browser has been shown: it is drawn when ``wanted`` is ahead, and until it is sharp."""
+    """State of one browser: it is drawn when ``wanted`` is ahead, and until it is sharp."""
 
     def __init__(self, client: Any) -> None:
         self.client = client
@@ -285,11 +285,11 @@ class _Screen:
 
 
 def _composed(rendered: Rendered, look: Look) -> tuple[ImageArray, str]:
-    """The picture for the page, and what to say about it."""
+    """Return the image for the page, and a note about it."""
     if look.mode != "depth":
-        return picture(rendered, look.mode), ""
+        return to_image(rendered, look.mode), ""
     depths = depth_range([rendered])
-    pixels = picture(rendered, "depth", depths)
+    pixels = to_image(rendered, "depth", depths)
     if pixels.shape[1] >= 200 and pixels.shape[0] >= 64:
         pixels[:, -64:] = colour_bar(pixels.shape[0], depths)
     return pixels, f", depth {depths[0]:.3g} to {depths[1]:.3g}"

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from gridreg.export.pictures import MODES
+from gridreg.export.images import MODES
 
 __all__ = ["Look", "Panel"]
 
@@ -16,11 +16,11 @@ _SMALLEST, _LARGEST = 64, 1600
 
 @dataclass(frozen=True)
 class Look:
-    """What the controls say.
+    """State of the controls.
 
     Args:
-        mode: one of `gridreg.export.pictures.MODES`.
-        size: longer edge of the picture at rest, pixels.
+        mode: one of `gridreg.export.images.MODES`.
+        size: longer edge of the image at rest, pixels.
         step: of the masks; None: as trained.
         off: names of masks that are taken off.
     """
@@ -39,8 +39,8 @@ class Panel:
         masks: names of the masks, one switch for each.
         steps: step now and steps in all, for the slider; without masks there is none.
         changed: called whenever the look has changed.
-        snapshot: called with the ``viser.ClientHandle`` that asked for a picture.
-        size: longer edge of the picture at rest, pixels.
+        snapshot: called with the ``viser.ClientHandle`` that asked for an image.
+        size: longer edge of the image at rest, pixels.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class Panel:
     ) -> None:
         self._changed = changed
         self._pinned, self._reached = False, steps[0]
-        self._status = server.gui.add_markdown("waiting for the first picture")
+        self._status = server.gui.add_markdown("waiting for the first image")
         self._mode = server.gui.add_dropdown("Show", MODES, initial_value=MODES[0])
         self._size = server.gui.add_slider(
             "Resolution",
@@ -69,7 +69,7 @@ class Panel:
         if masks:
             self._add_masks(server, masks, steps)
         self.cameras = server.gui.add_checkbox("Training cameras", True)
-        button = server.gui.add_button("Snapshot", hint="saves this picture at full resolution")
+        button = server.gui.add_button("Snapshot", hint="saves this image at full resolution")
         button.on_click(lambda event: snapshot(event.client))
         for control in (self._mode, self._size, *self._switches.values()):
             control.on_update(lambda _: changed())
@@ -98,7 +98,7 @@ class Panel:
 
     @property
     def look(self) -> Look:
-        """What the controls say now."""
+        """State of the controls now, within their ranges."""
         step = int(self._step.value) if self._pinned and self._step is not None else None
         off = frozenset(name for name, switch in self._switches.items() if not switch.value)
         # What a browser says may lie outside of what its controls offer.

@@ -1,4 +1,4 @@
-"""Frames to files: MP4 through ffmpeg, GIF, or a folder of PNG pictures; whole or not at all."""
+"""Frames to files: MP4 through ffmpeg, GIF, or a folder of PNG images; whole or not at all."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ __all__ = ["check_target", "find_ffmpeg", "write_video"]
 
 
 def check_target(path: Path, fps: float) -> None:
-    """Refuse what cannot become a film, before it is rendered; make the folder that it goes to.
+    """Refuse what cannot become a video, before it is rendered; make the folder that it goes to.
 
     Raises:
         InputError: for another suffix or speed, without ffmpeg (MP4), or if the place is not writable.

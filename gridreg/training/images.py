@@ -20,6 +20,7 @@ from gridreg.errors import InputError
 from gridreg.training.files import write_bytes
 
 __all__ = [
+    "DEPTH_COLOURS",
     "ImageArray",
     "coloured",
     "depth_limits",
@@ -33,6 +34,9 @@ __all__ = [
 ]
 
 ImageArray = NDArray[np.uint8]
+
+DEPTH_COLOURS = "turbo"
+"""Colour map of depths wherever they are shown: near is dark blue, far dark red."""
 
 _TEXT = 13
 _STRIP = 20

@@ -14,6 +14,7 @@ from torch import Tensor
 from gridreg.errors import InputError
 from gridreg.training.evaluate import Scored
 from gridreg.training.images import (
+    DEPTH_COLOURS,
     ImageArray,
     coloured,
     depth_limits,
@@ -107,10 +108,10 @@ def depth_image(depth: Tensor, opacity: Tensor) -> ImageArray:
     share = opacity.detach().double().nan_to_num(0).clamp(0, 1).cpu()
     distance = depth.detach().double().nan_to_num(0).cpu() / share.clamp(min=1e-6)
     near, far = depth_limits(distance[share > 0.5])
-    image = fading_into_white(coloured(distance.numpy(), near, far, "viridis_r"), share)
+    image = fading_into_white(coloured(distance.numpy(), near, far, DEPTH_COLOURS), share)
     zoom = max(1, math.ceil(200 / max(share.shape)))
     body = thumbnail(image, zoom * max(share.shape))
-    return row([body, scale_bar(body.shape[0], near, far, "viridis_r", "depth")])
+    return row([body, scale_bar(body.shape[0], near, far, DEPTH_COLOURS, "depth")])
 
 
 def save_view(

@@ -1,4 +1,4 @@
-"""Pictures of renders: colour, depth with a colour bar, opacity."""
+"""Images of renders: colour, depth with a colour bar, opacity."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from gridreg.errors import InputError
 from gridreg.rendering import Rendered
 from gridreg.training.images import (
+    DEPTH_COLOURS,
     ImageArray,
     coloured,
     depth_limits,
@@ -19,17 +20,16 @@ from gridreg.training.images import (
     to_uint8,
 )
 
-__all__ = ["MODES", "DepthRange", "check_mode", "colour_bar", "depth_range", "picture", "z_depth"]
+__all__ = ["MODES", "DepthRange", "check_mode", "colour_bar", "depth_range", "to_image", "z_depth"]
 
 MODES = ("rgb", "depth", "opacity")
-"""What can be seen of a render."""
+"""Quantities of a render that an image can show."""
 
 DepthRange = tuple[float, float]
 
-_COLOURMAP = "turbo"
 # Depths of rays that hit next to nothing are noise.
 _SEEN = 0.05
-# World units; beyond what a field holds, within what the viewer's depth pictures can say.
+# World units; beyond what a field holds, within what the viewer's depth images can say.
 _FAR = 150.0
 
 
@@ -53,7 +53,7 @@ def depth_range(renders: Sequence[Rendered]) -> DepthRange:
     return depth_limits(torch.cat([d.reshape(-1) for d in depths]) if depths else torch.zeros(0))
 
 
-def picture(rendered: Rendered, mode: str, depths: DepthRange | None = None) -> ImageArray:
+def to_image(rendered: Rendered, mode: str, depths: DepthRange | None = None) -> ImageArray:
     """One mode of a render as an image.
 
     Depth is the mean distance of what a pixel hits, from near (dark blue) to far (dark red), blended into
@@ -77,13 +77,13 @@ def picture(rendered: Rendered, mode: str, depths: DepthRange | None = None) -> 
         return to_uint8(rendered.opacity[..., None].expand(*rendered.opacity.shape, 3))
     near, far = depth_range([rendered]) if depths is None else depths
     mean = rendered.depth / rendered.opacity.clamp(min=_SEEN)
-    colours = coloured(mean.detach().double().cpu().numpy(), near, far, _COLOURMAP)
+    colours = coloured(mean.detach().double().cpu().numpy(), near, far, DEPTH_COLOURS)
     return fading_into_white(colours, rendered.opacity)
 
 
 def colour_bar(height: int, depths: DepthRange) -> ImageArray:
-    """The scale of depth pictures ``(height, 64, 3)`` uint8: near below, far above, in world units."""
-    return scale_bar(height, *depths, _COLOURMAP)
+    """The scale of depth images ``(height, 64, 3)`` uint8: near below, far above, in world units."""
+    return scale_bar(height, *depths, DEPTH_COLOURS)
 
 
 def z_depth(rendered: Rendered, intrinsics: tuple[float, float, float, float]) -> NDArray[np.float32]:
