@@ -236,9 +236,7 @@ def test_text_and_lines_stand_out(page: Page, dark: bool) -> None:
 def test_a_line_stands_out_under_the_pointer(page: Page) -> None:
     x, y = middle(page, ".legend li:nth-child(2)")
     page.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
-    lit = page.evaluate(
-        "[...document.querySelectorAll('.curves.fade polyline.lit')].map((e) => e.dataset.series)"
-    )
+    lit = page.evaluate("[...document.querySelectorAll('.curves.fade g.lit')].map((e) => e.dataset.series)")
     assert set(lit) == {"tensorf"}
 
 

@@ -207,8 +207,8 @@ def cluster(tmp_path_factory):
         patch.setenv("TMPDIR", str(folder))
         small = {"object_store_memory": 80 * 2**20}
         quick = {"health_check_period_ms": 500, "health_check_failure_threshold": 4}
-        # On a machine that others fill, Ray would kill the very workers that are watched here.
-        system = {**quick, "memory_monitor_refresh_ms": 0}
+        # On a busy machine, Ray's workers would hardly ever have a turn, and be killed for the memory that others take.
+        system = {**quick, "worker_niceness": 0, "memory_monitor_refresh_ms": 0}
         head = {"num_cpus": 0, "include_dashboard": False, "_system_config": system, **small}
         cluster = Cluster(initialize_head=True, head_node_args=head)
         nodes = [cluster.add_node(num_cpus=1, **small) for _ in range(2)]

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import re
 
 import numpy as np
 import pytest
 
 from gridreg.ablation.comparison import Section, compare, figure_of
-from gridreg.ablation.tables import csv_rows, difference_text, duration, latex, markdown, mean_text, notes_of
+from gridreg.ablation.tables import difference_text, duration, latex, markdown, mean_text, notes_of
 from gridreg.errors import InputError
 from tests.ablation_results import GAINS, NASTY, done, failed, psnr_of, spec, study_of
 
@@ -193,20 +191,17 @@ def test_latex_is_balanced_whatever_the_labels() -> None:
     assert r"\textbf" not in text
 
 
-def test_csv_rows_have_full_figures_and_equal_keys() -> None:
-    rows = csv_rows(sections("builtin", "lego", "chair"))
-    assert len({tuple(row) for row in rows}) == 1
-    out = io.StringIO()
-    writer = csv.DictWriter(out, rows[0].keys())
-    writer.writeheader()
-    writer.writerows(rows)
-    back = list(csv.DictReader(io.StringIO(out.getvalue())))
-    assert len(back) == len(LABELS) * (3 + 2)
-    tensorf = [row for row in back if row["composition"] == "tensorf" and row["scene"] == "lego"]
-    assert float(tensorf[0]["psnr"]) == np.mean([psnr_of(spec("tensorf", seed=s)) for s in range(3)])
-    assert tensorf[0]["pairs"] == "3"
-    assert {row["builtin"] for row in back if row["scene"] == "builtin"} == {"True"}
-    assert {row["composition"] for row in back} == set(LABELS) <= set(GAINS)
+def test_figures_by_scene_are_full() -> None:
+    builtin = [s for s in sections("builtin", "lego", "chair") if s.setting.builtin]
+    assert [s.scenes for s in builtin] == [("builtin",)]
+    (own,) = [s for s in sections("builtin", "lego", "chair") if not s.setting.builtin]
+    assert tuple(row.label for row in own.rows) == LABELS
+    assert set(LABELS) <= set(GAINS)
+    tensorf = next(row for row in own.rows if row.label == "tensorf")
+    assert tensorf.scenes["lego"].mean == np.mean([psnr_of(spec("tensorf", seed=s)) for s in range(3)])
+    estimate = tensorf.scene_differences["lego"].estimate
+    assert estimate is not None
+    assert estimate.count == 3
 
 
 @pytest.mark.parametrize(("seconds", "text"), [(0.04, "0.0 s"), (59.96, "1:00 min"), (3599.7, "1:00:00 h")])

@@ -3,29 +3,42 @@
 from __future__ import annotations
 
 import base64
-import json
 import os
-import re
-from collections.abc import Iterable, Mapping, Sequence
-from importlib.resources import files
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-from gridreg.ablation.comparison import Section, compare
-from gridreg.ablation.curves import curves, over_views
+from gridreg.ablation.charts import curves, over_views, styles
+from gridreg.ablation.comparison import Row, Section, compare
 from gridreg.ablation.differences import forest_plot, heat_map
-from gridreg.ablation.html_parts import escaped, failures, findings, provenance, sortable_table, wipe
-from gridreg.ablation.mask_pictures import mask_schedules
+from gridreg.ablation.mask_images import colour_scale, mask_schedules
 from gridreg.ablation.records import RunResult, Study
-from gridreg.ablation.tables import latex, markdown
-from gridreg.ablation.wipes import wipe_data
+from gridreg.ablation.tables import (
+    COLUMNS,
+    LEGEND,
+    SIGNS,
+    difference_text,
+    duration,
+    latex,
+    markdown,
+    mean_text,
+    notes_of,
+    signed,
+)
+from gridreg.ablation.templates import render
+from gridreg.ablation.wipes import first_choice, wipe_data
 from gridreg.errors import InputError
+from gridreg.scenes.protocols import get_protocol
 from gridreg.training.files import write_bytes
 
-__all__ = ["PICTURE_BYTES", "HasResults", "write_report"]
+__all__ = ["IMAGE_BYTES", "HasResults", "findings", "provenance", "write_report"]
 
-PICTURE_BYTES = 6_000_000
-"""Default bound on what pictures add to the page."""
+IMAGE_BYTES = 6_000_000
+"""Default bound on what images add to the page."""
+
+_FIGURES = (signed, mean_text, difference_text, duration, notes_of)
+_VERSIONS = ("gridreg", "torch", "numpy", "numba", "python")
+_MACHINE = ("cpu", "instructions", "cores", "threads")
 
 
 class HasResults(Protocol):
@@ -54,7 +67,7 @@ class _Histories:
 
 
 def write_report(
-    store: HasResults, study: Study, path: str | os.PathLike[str], *, picture_bytes: int = PICTURE_BYTES
+    store: HasResults, study: Study, path: str | os.PathLike[str], *, image_bytes: int = IMAGE_BYTES
 ) -> Path:
     """Write the report of a study, and its tables as Markdown and LaTeX beside it.
 
@@ -64,7 +77,7 @@ def write_report(
         store: gives the results of the study.
         study: what was asked.
         path: of the HTML file; the tables have its name with the endings ``.md`` and ``.tex``.
-        picture_bytes: bound on what the pictures of the slider add to the file.
+        image_bytes: bound on what the images of the slider add to the file.
 
     Returns:
         The path.
@@ -77,95 +90,113 @@ def write_report(
         raise InputError(f"{place}: found the ending {place.suffix!r}, expected .html")
     results = store.results(study)
     sections = compare(study, results)
-    page = _page(study, results, sections, picture_bytes)
     for ending, text in (
         (".md", markdown(study.title, sections)),
         (".tex", latex(study.title, sections)),
-        (place.suffix, page),
+        (place.suffix, _page(study, results, sections, image_bytes)),
     ):
         # Names of files that are not UTF-8 hold lone surrogates, which UTF-8 cannot write.
         write_bytes(place.with_suffix(ending), text.encode("utf-8", "backslashreplace"))
     return place
 
 
-def _page(study: Study, results: Sequence[RunResult], sections: Sequence[Section], picture_bytes: int) -> str:
+def _page(study: Study, results: Sequence[RunResult], sections: Sequence[Section], image_bytes: int) -> str:
     histories = _Histories()
-    pictures = wipe_data(sections, picture_bytes)
-    parts = [
-        _section(number, section, histories, pictures[number]) for number, section in enumerate(sections)
-    ]
-    views = over_views(sections)
-    if views:
-        parts.insert(0, f'<section id="views" class="curves"><h2>More views</h2>{views}</section>')
-    masks = mask_schedules(results, histories)
-    done = sum(result.status == "done" for result in results)
-    lead = f"{done} of {len(study.runs)} runs are finished. Baseline: {study.baseline}."
-    return _filled(
-        _file("report.html"),
-        {
-            "title": escaped(study.title),
-            "lead": escaped(lead),
-            "contents": _contents(sections, bool(views), bool(masks)),
-            "style": _file("report.css").strip(),
-            "script": _file("report.js").strip(),
-            "sections": "\n".join(parts),
-            "masks": f"<h2>How the masks open</h2>{masks}" if masks else "",
-            "failures": failures(results, histories.problems),
-            "provenance": provenance(study, results),
-            "file": escaped(f"{study.name}.yaml"),
-            "download": _yaml_uri(study.source),
-            "source": escaped(study.source),
-            "pictures": _script_data(pictures),
-        },
+    images = wipe_data(sections, image_bytes)
+    source = study.source.encode("utf-8", "backslashreplace")
+    return render(
+        "report.html",
+        study=study,
+        done=sum(result.status == "done" for result in results),
+        views=over_views(sections),
+        sections=[
+            {
+                "section": section,
+                "styles": styles(section.rows),
+                "findings": findings(section),
+                "forest": forest_plot(section),
+                "heat": heat_map(section),
+                "curves": curves(section, histories),
+                "choice": first_choice(section, own) if own else None,
+            }
+            for section, own in zip(sections, images, strict=True)
+        ],
+        masks=mask_schedules(results, histories),
+        scale=colour_scale(),
+        failed=[result for result in results if result.status == "failed"],
+        problems=histories.problems,
+        provenance=provenance(study, results),
+        download="data:text/yaml;base64," + base64.b64encode(source).decode(),
+        images=images,
+        columns=COLUMNS,
+        legend=LEGEND,
+        signs=SIGNS,
+        tone=lambda outcome: {"higher": "up", "lower": "down"}.get(outcome, "noise"),
+        styles=styles,
+        **{function.__name__: function for function in _FIGURES},
     )
 
 
-def _section(
-    number: int, section: Section, histories: _Histories, pictures: Sequence[Mapping[str, Any]]
-) -> str:
-    forest, heat, lines = forest_plot(section), heat_map(section), curves(section, histories)
-    parts = [
-        f'<section id="table{number}"><h2>{escaped(section.setting.title)}</h2>',
-        f'<p class="lead">Scenes: {escaped(section.extent)}</p>',
-        findings(section),
-        sortable_table(section),
-        f"<h3>Paired differences</h3>{forest}{_FOREST_NOTE}" if forest else "",
-        f"<h3>By scene</h3>{heat}" if heat else "",
-        f'<h3>Over time</h3><div class="curves">{lines}</div>' if lines else "",
-        wipe(number, section, pictures),
-        "</section>",
-    ]
-    return "\n".join(part for part in parts if part)
+def findings(section: Section) -> dict[str, list[str]]:
+    """What the differences say: names of rows, with a remark, under ``better``, ``worse`` and so on."""
+    groups: dict[str, list[str]] = {"better": [], "worse": [], "within noise": [], "cannot be told": []}
+    for row in section.rows:
+        if row.is_baseline:
+            continue
+        kind, remark = _finding(row)
+        groups[kind].append(f"{row.name} ({remark})" if remark else row.name)
+    return {title: names for title, names in groups.items() if names}
 
 
-_FOREST_NOTE = (
-    '<p class="note">Large dots are means, bars their 95 % intervals, small dots single pairs. Hollow: within noise, '
-    "or not a finding any more among so many rows (Holm).</p>"
-)
+def _finding(row: Row) -> tuple[str, str]:
+    outcome, found = row.outcome, row.difference.estimate if row.difference else None
+    if outcome in ("higher", "lower") and found is not None:
+        return "better" if outcome == "higher" else "worse", f"{signed(found.mean)} dB"
+    if outcome == "within noise":
+        return outcome, ""
+    if outcome.endswith("uncorrected"):
+        return "within noise", "a finding by itself, not among so many rows"
+    return "cannot be told", outcome
 
 
-def _contents(sections: Sequence[Section], views: bool, masks: bool) -> str:
-    links = [("views", "More views")] * views
-    links += [(f"table{number}", section.setting.title) for number, section in enumerate(sections)]
-    links += [("masks", "Masks")] * masks
-    links += [("provenance", "Machine and versions"), ("study", "The study")]
-    return " ".join(f'<a href="#{anchor}">{escaped(text)}</a>' for anchor, text in links)
+def provenance(study: Study, results: Sequence[RunResult]) -> list[tuple[str, str]]:
+    """Where the figures come from: protocols with their views, conventions of the metrics, versions and machines."""
+    done = [result for result in results if result.status == "done" and result.metrics is not None]
+    entries: list[tuple[str, str]] = []
+    for protocol in dict.fromkeys(spec.protocol for spec in study.runs):
+        entries.append((f"protocol {protocol}", _protocol(protocol, done)))
+    conventions: dict[str, str] = {}
+    for result in done:
+        conventions.update((result.metrics or {}).get("conventions", {}))
+    entries += sorted(conventions.items())
+    for keys, title in ((_VERSIONS, "versions"), (_MACHINE, "machine")):
+        found = dict.fromkeys(_versions(result, keys, with_name=title == "machine") for result in done)
+        entries += [
+            (title if len(found) == 1 else f"{title} {n}", text) for n, text in enumerate(found, 1) if text
+        ]
+    total = sum(result.seconds for result in done)
+    return [*entries, ("runs", f"{len(done)} finished, {duration(total)} in all")]
 
 
-def _filled(template: str, values: Mapping[str, str]) -> str:
-    """The template with every ``{{name}}`` replaced; what is put in is not looked at again."""
-    return re.sub(r"\{\{(\w+)\}\}", lambda match: values[match[1]], template)
+def _protocol(name: str, done: Sequence[RunResult]) -> str:
+    own: list[dict[str, Any]] = [r.metrics or {} for r in done if r.spec.protocol == name]
+    parts = []
+    try:
+        parts.append(f"background {get_protocol(name).background}")
+    except InputError:
+        parts.append("not known here")
+    trained = dict.fromkeys(tuple(metrics.get("train_views", ())) for metrics in own)
+    if len(trained) == 1:
+        views = next(iter(trained))
+        shown = " ".join(views[:12]) + (" ..." if len(views) > 12 else "")
+        parts.append(f"trained on {len(views)} views: {shown}")
+    tested = sorted({int(metrics["test_views"]) for metrics in own if "test_views" in metrics})
+    if tested:
+        parts.append(f"scored on {' or '.join(map(str, tested))} test views of each scene")
+    return "; ".join(parts)
 
 
-def _file(name: str) -> str:
-    return (files("gridreg.ablation") / "page" / name).read_text(encoding="utf-8")
-
-
-def _yaml_uri(source: str) -> str:
-    return "data:text/yaml;base64," + base64.b64encode(source.encode("utf-8", "backslashreplace")).decode()
-
-
-def _script_data(value: Iterable[Any]) -> str:
-    """JSON that cannot end the script element it stands in."""
-    text = json.dumps(value, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
-    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+def _versions(result: RunResult, keys: Sequence[str], *, with_name: bool) -> str:
+    versions = (result.metrics or {}).get("versions", {})
+    parts = [f"{key} {versions[key]}" for key in keys if key in versions]
+    return ", ".join([result.machine] * (with_name and bool(result.machine)) + parts)

@@ -1,4 +1,4 @@
-"""Tables of a study as Markdown, as LaTeX, and as rows for a CSV file.
+"""Tables of a study as Markdown and as LaTeX, and figures as text.
 
 Nothing is set in bold: the best figure of a column is often the luckiest. What differs from the baseline by more than
 noise is told by a sign beside the difference, and the rest is said to be within noise.
@@ -6,16 +6,17 @@ noise is told by a sign beside the difference, and the rest is said to be within
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from gridreg.ablation.comparison import Row, Section
 from gridreg.ablation.statistics import Estimate
+from gridreg.ablation.templates import render
 
 __all__ = [
+    "COLUMNS",
+    "LEGEND",
     "MINUS",
     "SIGNS",
-    "csv_rows",
     "difference_text",
     "duration",
     "latex",
@@ -44,14 +45,15 @@ LEGEND = (
     "training views."
 )
 
-_COLUMNS = ("composition", "PSNR (dB)", "Δ PSNR (dB)", "SSIM (Gaussian)", "training", "runs", "notes")
-_LATEX_SPECIAL = {
-    "\\": r"\textbackslash{}", "{": r"\{", "}": r"\}", "$": r"\$", "&": r"\&", "#": r"\#", "%": r"\%", "_": r"\_",
-    "^": r"\textasciicircum{}", "~": r"\textasciitilde{}", "<": r"\textless{}", ">": r"\textgreater{}",
-    '"': r"\textquotedbl{}", "|": r"\textbar{}",
-    MINUS: "$-$", "–": "--", "±": r"$\pm$", "Δ": r"$\Delta$", "α": r"$\alpha$", "≈": r"$\approx$", "·": r"$\cdot$",
-    "▲": r"$\blacktriangle$", "▼": r"$\blacktriangledown$", "△": r"$\vartriangle$", "▽": r"$\triangledown$",
-}  # fmt: skip
+COLUMNS: tuple[str, ...] = (
+    "composition",
+    "PSNR (dB)",
+    "Δ PSNR (dB)",
+    "SSIM (Gaussian)",
+    "training",
+    "runs",
+    "notes",
+)
 
 
 def signed(value: float, digits: int = 2) -> str:
@@ -106,22 +108,6 @@ def notes_of(row: Row) -> list[str]:
     return notes
 
 
-def _cells(row: Row) -> list[str]:
-    return [
-        row.name,
-        mean_text(row.metrics.get("psnr")),
-        difference_text(row),
-        mean_text(row.metrics.get("ssim_gaussian"), 3),
-        duration(row.seconds.mean) if row.seconds else "–",
-        f"{row.done}" if row.done == row.expected else f"{row.done} of {row.expected}",
-        ", ".join(notes_of(row)),
-    ]
-
-
-def _scene_cells(row: Row, scenes: Sequence[str]) -> list[str]:
-    return [row.name, *(mean_text(row.scenes.get(scene)) for scene in scenes)]
-
-
 def markdown(title: str, sections: Sequence[Section]) -> str:
     """All tables of a study in Markdown (GitHub's tables), with a legend.
 
@@ -129,110 +115,30 @@ def markdown(title: str, sections: Sequence[Section]) -> str:
         title: heading.
         sections: of `gridreg.ablation.comparison.compare`.
     """
-    parts = [f"# {_markdown(title)}"]
-    for section in sections:
-        parts += [f"## {_markdown(section.setting.title)}", f"Scenes: {_markdown(section.extent)}"]
-        parts.append(_markdown_table(_COLUMNS, [_cells(row) for row in section.rows]))
-        if len(section.scenes) > 1:
-            head = ("PSNR (dB)", *section.scenes)
-            parts.append(_markdown_table(head, [_scene_cells(row, section.scenes) for row in section.rows]))
-    parts.append(LEGEND)
-    return "\n\n".join(parts) + "\n"
+    return render("tables.md", title=title, sections=sections, tables=_tables, legend=LEGEND)
 
 
 def latex(title: str, sections: Sequence[Section]) -> str:
-    """All tables of a study in LaTeX; they need the packages booktabs and amssymb.
-
-    Args:
-        title: goes into the captions.
-        sections: of `gridreg.ablation.comparison.compare`.
-    """
-    parts = [r"% \usepackage{booktabs,amssymb}"]
-    for section in sections:
-        caption = f"{title}: {section.setting.title}. Scenes: {section.extent}. {LEGEND}"
-        parts.append(_latex_table(_COLUMNS, [_cells(row) for row in section.rows], caption))
-        if len(section.scenes) > 1:
-            head = ("PSNR (dB)", *section.scenes)
-            body = [_scene_cells(row, section.scenes) for row in section.rows]
-            parts.append(_latex_table(head, body, f"{title}: {section.setting.title}, by scene."))
-    return "\n\n".join(parts) + "\n"
+    """All tables of a study in LaTeX, which need the packages booktabs and amssymb; arguments as of `markdown`."""
+    return render("tables.tex", title=title, sections=sections, tables=_tables, legend=LEGEND)
 
 
-def csv_rows(sections: Sequence[Section]) -> list[dict[str, str | int | float | bool | None]]:
-    """One flat row for each table row and scene, and one with ``scene`` empty for all scenes together.
-
-    Every row has the same keys. Figures are numbers in full precision, None where there is none.
-    """
-    rows: list[dict[str, str | int | float | bool | None]] = []
-    metrics = dict.fromkeys(m for section in sections for row in section.rows for m in row.metrics)
-    for section in sections:
-        for row in section.rows:
-            for scene in ("", *section.scenes):
-                difference = row.scene_differences.get(scene) if scene else row.difference
-                found = difference.estimate if difference else None
-                known = {"psnr": row.scenes.get(scene)} if scene else row.metrics
-                figures = {name: known.get(name) for name in metrics}
-                seconds = row.seconds.mean if row.seconds and not scene else None
-                rows.append(
-                    {
-                        "builtin": section.setting.builtin,
-                        "protocol": section.setting.protocol,
-                        "views": section.setting.views,
-                        "composition": row.label,
-                        "preset": row.preset,
-                        "backbone": row.backbone,
-                        "scene": scene,
-                        "uses_alpha": row.uses_alpha,
-                        **{name: value.mean if value else None for name, value in figures.items()},
-                        **{f"{n}_half_width": v.half_width if v else None for n, v in figures.items()},
-                        "psnr_difference": found.mean if found else None,
-                        "psnr_difference_half_width": found.half_width if found else None,
-                        "pairs": found.count if found else 0,
-                        "outcome": row.outcome if not scene else (difference.verdict if difference else ""),
-                        "train_seconds": seconds,
-                    }
-                )
-    return rows
+def _tables(section: Section) -> list[tuple[tuple[str, ...], list[tuple[str, ...]]]]:
+    """Head and body of the table of a section, and of the one by scene where there are several scenes."""
+    found = [(COLUMNS, [_cells(row) for row in section.rows])]
+    if len(section.scenes) > 1:
+        body = [(row.name, *(mean_text(row.scenes.get(s)) for s in section.scenes)) for row in section.rows]
+        found.append((("PSNR (dB)", *section.scenes), body))
+    return found
 
 
-def _markdown(text: str) -> str:
-    safe = text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
-    # A backslash before punctuation makes it text, in tables too.
-    return re.sub(r"([\\`*_\[\]#|~$!])", r"\\\1", " ".join(safe.split()))
-
-
-def _latex(text: str) -> str:
-    return "".join(_LATEX_SPECIAL.get(character, character) for character in " ".join(text.split()))
-
-
-def _markdown_table(head: Sequence[str], body: Sequence[Sequence[str]]) -> str:
-    def line(cells: Sequence[str], escape: Callable[[str], str] = _markdown) -> str:
-        return "| " + " | ".join(escape(cell) for cell in cells) + " |"
-
-    rule = ["---"] + ["---:"] * (len(head) - 1)
-    return "\n".join([line(head), line(rule, str), *(line(cells) for cells in body)])
-
-
-def _latex_table(head: Sequence[str], body: Sequence[Sequence[str]], caption: str) -> str:
-    def line(cells: Sequence[str]) -> str:
-        # After a row's end, LaTeX takes an opening bracket for an option.
-        return (
-            "  "
-            + " & ".join(f"{{{text}}}" if (text := _latex(c))[:1] == "[" else text for c in cells)
-            + r" \\"
-        )
-
-    return "\n".join(
-        [
-            r"\begin{table}",
-            rf"  \caption{{{_latex(caption)}}}",
-            rf"  \begin{{tabular}}{{l{'r' * (len(head) - 1)}}}",
-            r"  \toprule",
-            line(head),
-            r"  \midrule",
-            *(line(cells) for cells in body),
-            r"  \bottomrule",
-            r"  \end{tabular}",
-            r"\end{table}",
-        ]
+def _cells(row: Row) -> tuple[str, ...]:
+    return (
+        row.name,
+        mean_text(row.metrics.get("psnr")),
+        difference_text(row),
+        mean_text(row.metrics.get("ssim_gaussian"), 3),
+        duration(row.seconds.mean) if row.seconds else "–",
+        f"{row.done}" if row.done == row.expected else f"{row.done} of {row.expected}",
+        ", ".join(notes_of(row)),
     )

@@ -5,8 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,75 +15,69 @@ from PIL import Image, UnidentifiedImageError
 from gridreg.ablation.comparison import Section
 from gridreg.ablation.records import RunResult
 
-__all__ = ["LONGEST_SIDE", "VIEWS_PER_SCENE", "encode", "wipe_data"]
+__all__ = ["LONGEST_SIDE", "VIEWS_PER_SCENE", "data_uri", "encode", "first_choice", "wipe_data"]
 
 LONGEST_SIDE = 400
 VIEWS_PER_SCENE = 4
 
 _QUALITY = 88
-_TARGET = "target"
-# Above the pictures in NAME_compare.png stand their names.
+# Above the images in NAME_compare.png stand their names.
 _STRIP = 20
 
 
-@dataclass(frozen=True)
-class _Candidate:
-    section: int
-    scene: str
-    view: str
-    runs: dict[str, RunResult]
-
-
 def wipe_data(sections: Sequence[Section], budget: int) -> list[list[dict[str, Any]]]:
-    """Pictures for the slider, by section, as plain data.
+    """Images for the slider, by section, as plain data.
 
     Of every scene one view after the other, evenly spread over the test views, until the budget is used up. All rows
     show the same seed where they have one in common.
 
     Args:
         sections: tables.
-        budget: of all pictures together, bytes of the page.
+        budget: of all images together, bytes of the page.
 
     Returns:
         For each section a list of ``{"scene", "view", "seed", "images": [{"name", "psnr", "src"}]}``; the target is the
-        first image. A picture that cannot be read is left out.
+        first image. An image that cannot be read is left out.
     """
-    data: list[list[dict[str, Any]]] = [[] for _ in sections]
+    places = [(number, scene) for number, section in enumerate(sections) for scene in section.scenes]
+    runs = {place: _runs_of(sections[place[0]], place[1]) for place in places}
+    views = {place: _views_of(runs[place].values()) for place in places}
+    found: dict[tuple[int, str], list[dict[str, Any]]] = {place: [] for place in places}
     used = 0
-    for candidate in _candidates(sections):
-        images = _images(candidate)
-        size = sum(len(image["src"]) for image in images)
-        if len(images) < 2 or used + size > budget:
-            continue
-        used += size
-        seeds = sorted({run.spec.seed for run in candidate.runs.values()})
-        entry = {
-            "scene": candidate.scene,
-            "view": candidate.view,
-            "seed": ", ".join(map(str, seeds)),
-            "images": images,
-        }
-        data[candidate.section].append(entry)
-    order = [{scene: index for index, scene in enumerate(section.scenes)} for section in sections]
-    for entries, places in zip(data, order, strict=True):
-        entries.sort(key=lambda entry: places[entry["scene"]])
-    return data
-
-
-def _candidates(sections: Sequence[Section]) -> Iterator[_Candidate]:
-    """Views in the order of their claim to space: one of every scene, then another of every scene."""
-    chosen: list[list[_Candidate]] = []
-    for number, section in enumerate(sections):
-        for scene in section.scenes:
-            runs = _runs_of(section, scene)
-            known = [set((run.metrics or {}).get("images", {})) for run in runs.values()]
-            views = sorted(set.intersection(*known), key=_natural) if known else []
-            spread = np.linspace(0, len(views) - 1, min(VIEWS_PER_SCENE, len(views))).round().astype(int)
-            chosen.append([_Candidate(number, scene, views[index], runs) for index in spread.tolist()])
+    # One of every scene, then another of every scene.
     for turn in range(VIEWS_PER_SCENE):
-        for candidates in chosen:
-            if turn < len(candidates):
-                yield candidates[turn]
+        for place in places:
+            if turn >= len(views[place]):
+                continue
+            view = views[place][turn]
+            images = _images(runs[place], view)
+            size = sum(len(image["src"]) for image in images)
+            if len(images) > 1 and used + size <= budget:
+                used += size
+                seeds = sorted({run.spec.seed for run in runs[place].values()})
+                entry = {
+                    "scene": place[1],
+                    "view": view,
+                    "seed": ", ".join(map(str, seeds)),
+                    "images": images,
+                }
+                found[place].append(entry)
+    return [
+        [entry for place in places if place[0] == number for entry in found[place]]
+        for number in range(len(sections))
+    ]
+
+
+def first_choice(section: Section, data: Sequence[Mapping[str, Any]]) -> tuple[str, str]:
+    """Names of what the slider shows at first: the baseline, and what is best beside it."""
+    names = [image["name"] for image in data[0]["images"]]
+    baseline = next((row.name for row in section.rows if row.is_baseline and row.name in names), names[0])
+    gains = {
+        row.name: row.difference.estimate.mean
+        for row in section.rows
+        if row.name in names and row.difference and row.difference.estimate
+    }
+    return baseline, max(gains, key=lambda name: gains[name], default=names[-1])
 
 
 def _runs_of(section: Section, scene: str) -> dict[str, RunResult]:
@@ -103,17 +96,27 @@ def _runs_of(section: Section, scene: str) -> dict[str, RunResult]:
     }
 
 
-def _images(candidate: _Candidate) -> list[dict[str, Any]]:
+def _views_of(runs: Iterable[RunResult]) -> list[str]:
+    """Names of test views that all runs have, evenly spread."""
+    known = [set((run.metrics or {}).get("images", {})) for run in runs]
+    # By the number in the name: r_8 comes before r_16.
+    order = {name: int("".join(filter(str.isdecimal, name)) or 0) for names in known for name in names}
+    views = sorted(set.intersection(*known), key=lambda name: (order[name], name)) if known else []
+    spread = np.linspace(0, len(views) - 1, min(VIEWS_PER_SCENE, len(views))).round().astype(int)
+    return [views[index] for index in spread.tolist()]
+
+
+def _images(runs: Mapping[str, RunResult], view: str) -> list[dict[str, Any]]:
     images: list[dict[str, Any]] = []
-    for name, run in candidate.runs.items():
-        render = _opened(run.folder / "test" / f"{candidate.view}.png")
+    for name, run in runs.items():
+        render = _opened(run.folder / "test" / f"{view}.png")
         if render is None:
             continue
         if not images:
-            target = _target(run.folder / "test" / f"{candidate.view}_compare.png", render)
+            target = _target(run.folder / "test" / f"{view}_compare.png", render)
             if target is not None:
-                images.append({"name": _TARGET, "psnr": None, "src": encode(target)})
-        psnr = float((run.metrics or {})["images"][candidate.view].get("psnr", "nan"))
+                images.append({"name": "target", "psnr": None, "src": encode(target)})
+        psnr = float((run.metrics or {})["images"][view].get("psnr", "nan"))
         images.append({"name": name, "psnr": psnr if math.isfinite(psnr) else None, "src": encode(render)})
     return images
 
@@ -132,33 +135,29 @@ def _target(path: Path, render: Image.Image) -> Image.Image | None:
 
 def _opened(path: Path) -> Image.Image | None:
     try:
-        with Image.open(path) as image:
+        with Image.open(path, formats=["PNG"]) as image:
             converted: Image.Image = image.convert("RGB")
             return converted
-    except (OSError, UnidentifiedImageError):
+    except (OSError, UnidentifiedImageError, Image.DecompressionBombError):
         return None
 
 
 def encode(image: Image.Image) -> str:
-    """A picture as data URI, at most `LONGEST_SIDE` pixels: PNG, or JPEG without colour subsampling if smaller.
+    """An image as data URI, at most `LONGEST_SIDE` pixels: PNG, or JPEG without colour subsampling if smaller.
 
     >>> encode(Image.new("RGB", (4, 4)))[:22]
     'data:image/png;base64,'
     """
-    scale = LONGEST_SIDE / max(image.size)
-    if scale < 1:
+    if max(image.size) > LONGEST_SIDE:
+        scale = LONGEST_SIDE / max(image.size)
         size = (max(1, round(image.width * scale)), max(1, round(image.height * scale)))
         image = image.resize(size, Image.Resampling.BOX, reducing_gap=None)
-    found = []
-    for kind, options in (("png", {"optimize": True}), ("jpeg", {"quality": _QUALITY, "subsampling": 0})):
-        buffer = io.BytesIO()
-        image.save(buffer, format=kind, **options)  # type: ignore[arg-type]
-        found.append((len(buffer.getvalue()), kind, buffer.getvalue()))
-    _, kind, content = min(found)
-    return f"data:image/{kind};base64," + base64.b64encode(content).decode()
+    return min(data_uri(image, "png"), data_uri(image, "jpeg"), key=len)
 
 
-def _natural(name: str) -> tuple[int, str]:
-    """Order by the number in a name: r_8 comes before r_16."""
-    digits = "".join(character for character in name if character.isdigit())
-    return (int(digits or 0), name)
+def data_uri(image: Image.Image, kind: str = "png") -> str:
+    """An image as data URI, in the format ``png`` or ``jpeg``."""
+    buffer = io.BytesIO()
+    options: dict[str, Any] = {"optimize": True} if kind == "png" else {"quality": _QUALITY, "subsampling": 0}
+    image.save(buffer, format=kind, **options)
+    return f"data:image/{kind};base64," + base64.b64encode(buffer.getvalue()).decode()

@@ -1,0 +1,56 @@
+"""Pages and tables from the templates in ``page/``."""
+
+from __future__ import annotations
+
+import re
+from functools import cache
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+__all__ = ["render"]
+
+_LATEX_SPECIAL = {
+    "\\": r"\textbackslash{}", "{": r"\{", "}": r"\}", "$": r"\$", "&": r"\&", "#": r"\#", "%": r"\%", "_": r"\_",
+    "^": r"\textasciicircum{}", "~": r"\textasciitilde{}", "<": r"\textless{}", ">": r"\textgreater{}",
+    '"': r"\textquotedbl{}", "|": r"\textbar{}",
+    "\N{MINUS SIGN}": "$-$", "–": "--", "±": r"$\pm$", "Δ": r"$\Delta$", "α": r"$\alpha$", "≈": r"$\approx$",
+    "·": r"$\cdot$", "▲": r"$\blacktriangle$", "▼": r"$\blacktriangledown$", "△": r"$\vartriangle$",
+    "▽": r"$\triangledown$",
+}  # fmt: skip
+
+
+def render(template: str, **values: Any) -> str:
+    """The text that a template makes of some values; in HTML, text among them is escaped.
+
+    Args:
+        template: name of a file in ``page/``.
+        values: by the names that the template uses, all of which must be there.
+    """
+    return _environment().get_template(template).render(values)
+
+
+@cache
+def _environment() -> Environment:
+    environment = Environment(
+        loader=PackageLoader("gridreg.ablation", "page"),
+        autoescape=lambda name: name is not None and name.endswith(".html"),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    environment.filters |= {"markdown": _markdown, "latex": _latex}
+    return environment
+
+
+def _markdown(text: str) -> str:
+    safe = text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+    # A backslash before punctuation makes it text, in tables too.
+    return re.sub(r"([\\`*_\[\]#|~$!])", r"\\\1", " ".join(safe.split()))
+
+
+def _latex(text: str) -> str:
+    safe = "".join(_LATEX_SPECIAL.get(character, character) for character in " ".join(text.split()))
+    # After a row's end, LaTeX takes an opening bracket for an option.
+    return f"{{{safe}}}" if safe.startswith("[") else safe
