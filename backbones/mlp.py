@@ -14,7 +14,7 @@ from backbones.tensorial import density_shift_for
 from gridreg import ops
 from gridreg.attach.sites import Site, parameters
 from gridreg.encodings import octaves_of_channels
-from gridreg.ops.cpu.adam.optimizer import FusedAdam
+from gridreg.ops.fused_adam import FusedAdam
 from gridreg.ops.linear import Precision
 from gridreg.rendering import OccupancyGrid, RayMarchResult, Rays
 

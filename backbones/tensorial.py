@@ -14,7 +14,7 @@ from torch.nn import functional as F
 from backbones.decoders import Basis, make_decoder
 from gridreg import ops
 from gridreg.attach.sites import Site
-from gridreg.ops.cpu.adam.optimizer import FusedAdam
+from gridreg.ops.fused_adam import FusedAdam
 from gridreg.rendering import OccupancyGrid, Rays
 
 __all__ = ["TensorialField", "density_shift_for"]

@@ -11,10 +11,9 @@ from hypothesis import strategies as st
 
 from gridreg.base import LocalTerm
 from gridreg.ops import use_backend
-from gridreg.ops.cpu.adam import optimizer as adam
-from gridreg.ops.cpu.adam import update as adam_update
+from gridreg.ops.cpu.adam import step as adam
 from gridreg.ops.cpu.adam.layout import Layout, layout
-from gridreg.ops.cpu.adam.optimizer import FusedAdam
+from gridreg.ops.fused_adam import FusedAdam
 
 BETAS = (0.9, 0.99)
 
@@ -232,10 +231,11 @@ class TestExactness:
 def test_which_tensors_take_the_kernel(monkeypatch):
     calls = []
 
-    def record(jobs):
-        calls.extend(job.p.dtype for job in jobs)
-        return adam_update.update_flat(jobs)
+    def record(plans):
+        calls.extend(plan.step.p.dtype for plan in plans)
+        update_flat(plans)
 
+    update_flat = adam.update_flat
     monkeypatch.setattr(adam, "update_flat", record)
     strided = torch.nn.Parameter(torch.zeros(3, 2).T)
     for p in (grid((2, 3), 0), grid((2, 3), 0, torch.float64), strided):
@@ -247,19 +247,20 @@ def test_which_tensors_take_the_kernel(monkeypatch):
 
 
 def test_layout():
-    assert layout((7, 5), (0,)) == Layout(1, 7, 1, 1, 5)
-    assert layout((2, 3, 9, 14), (2, 3)) == Layout(6, 9, 1, 14, 1)
-    assert layout((4, 5, 6, 3), (2, 0, 1)) == Layout(1, 4, 5, 6, 3)
+    assert layout((7, 5), (0,)) == Layout(1, 7, 1, 5)
+    assert layout((2, 3, 9, 14), (2, 3)) == Layout(6, 9, 14, 1)
+    assert layout((2, 3, 9, 14), (3, -2)) == Layout(6, 9, 14, 1)
+    assert layout((4, 5, 6, 3), (2, 0, 1)) is None
     assert layout((4, 5, 6, 3), (0, 2)) is None
     assert layout((4, 5, 6, 3, 1), (0, 1, 2, 3)) is None
-    assert layout((4, 5), ()) == Layout(1, 1, 1, 1, 20)
+    assert layout((4, 5), ()) == Layout(1, 1, 1, 20)
 
 
 def test_blocks_do_not_matter(monkeypatch):
     """Old values pass correctly between blocks that are updated at the same time."""
     results = []
     for blocks in (1, 2, 7, 60):
-        monkeypatch.setattr(adam_update, "_BLOCKS", blocks)
+        monkeypatch.setattr(adam, "_BLOCKS", blocks)
         results.append(TestExactness().run(2)[0])
     assert all(torch.equal(results[0], other) for other in results[1:])
 

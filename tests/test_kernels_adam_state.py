@@ -10,7 +10,7 @@ import torch
 
 from gridreg.base import LocalTerm
 from gridreg.errors import InputError
-from gridreg.ops.cpu.adam.optimizer import FusedAdam
+from gridreg.ops.fused_adam import FusedAdam
 
 BETAS = (0.9, 0.99)
 

@@ -13,6 +13,7 @@ from gridreg.ops.cp import cp_density, cp_features, cp_march_density
 from gridreg.ops.dispatch import chosen_backend, use_backend
 from gridreg.ops.encode import encode, encode_together
 from gridreg.ops.encoded_mlp import Block, encoded_mlp
+from gridreg.ops.fused_adam import FusedAdam
 from gridreg.ops.gradient_buffers import accumulate_into_grad
 from gridreg.ops.linear import Layer, mlp, product_dtype
 from gridreg.ops.merging import merge_samples, spread_to_samples
@@ -22,6 +23,7 @@ from gridreg.ops.vm import vm_density, vm_features, vm_march_density
 __all__ = [
     "Activation",
     "Block",
+    "FusedAdam",
     "Layer",
     "MarchArguments",
     "RayMarchResult",

@@ -25,9 +25,9 @@ _SWITCH = "GRIDREG_COMPILE_AHEAD"
 _ORDER = (
     "encode._forward",
     "cpu.vm._density",
-    "cpu.adam.update._flat",
-    "cpu.adam.update._grid",
-    "cpu.adam.update._edges",
+    "cpu.adam.kernels.flat_step",
+    "cpu.adam.kernels.grid_step",
+    "cpu.adam.kernels.keep_edges",
     "cpu.vm_gradient._density_backward",
     "cpu.reductions._round",
     "cpu.reductions._measure",
