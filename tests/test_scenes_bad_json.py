@@ -101,8 +101,8 @@ class TestJson:
             ("fl_y", 0, "fl_y is 0.0, expected a positive"),
             ("cx", True, "cx is 'True', expected a finite number"),
             ("cy", float("inf"), "cy is 'inf', expected a finite number"),
-            ("w", 16.5, "w is 16.5, expected a whole number of pixels"),
-            ("h", 0, "h is 0.0, expected a whole number of pixels"),
+            ("w", -3, "w is -3.0, expected a positive number of pixels"),
+            ("h", 0, "h is 0.0, expected a positive number of pixels"),
             pytest.param("w", 10**400, "w is '10+', expected a finite number", id="huge"),
         ],
     )

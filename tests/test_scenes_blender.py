@@ -235,14 +235,15 @@ def test_extent_follows_cameras_that_are_not_those_of_nerf_synthetic(scene: Path
 
     edit(scene, change)
     loaded = load_scene(scene, "builtin8")
-    centre, half = loaded.bounds.mean(dim=0), (loaded.bounds[1] - loaded.bounds[0]) / 2
-    torch.testing.assert_close(centre, torch.tensor(shift, dtype=torch.float32), atol=1e-3, rtol=0)
-    # What the lens sees at the focus: 4.03 tan(0.3456) = 1.45, five times as large here.
-    torch.testing.assert_close(
-        half, torch.full((3,), scale * 4.0311 * math.tan(0.6911112 / 2)), atol=0.01, rtol=0
-    )
-    assert loaded.near == pytest.approx(scale * 4.0311 - float(half[0]) * math.sqrt(3), abs=0.01)
-    assert loaded.far == pytest.approx(scale * 4.0311 + float(half[0]) * math.sqrt(3), abs=0.01)
+    # The box reaches 1.3 to each side; where it lies in the world of the files is noted.
+    torch.testing.assert_close(loaded.bounds, torch.tensor([[-1.3] * 3, [1.3] * 3]))
+    np.testing.assert_allclose(loaded.world.origin, shift, atol=1e-3)
+    # What the lens sees at the focus: 4.03 tan(0.3456) = 1.45, five times as large in the files.
+    half = scale * 4.0311 * math.tan(0.6911112 / 2)
+    assert loaded.world.unit == pytest.approx(half / 1.3, rel=1e-3)
+    assert loaded.world.unit * loaded.near == pytest.approx(scale * 4.0311 - half * math.sqrt(3), abs=0.01)
+    assert loaded.world.unit * loaded.far == pytest.approx(scale * 4.0311 + half * math.sqrt(3), abs=0.01)
+    assert any("centred on" in note for note in loaded.notes)
 
 
 class TestFingerprint:

@@ -225,7 +225,12 @@ class TestBadInput:
 
     def test_missing_image(self, scene: Path) -> None:
         (scene / "images/r_3.png").unlink()
-        refused(scene, r"image r_3\.png: image .*images/r_3\.png not found")
+        loaded = load_scene(scene, "holdout8")
+        assert len(loaded.train) + len(loaded.test) == 17
+        assert "1 of 18 frames have no image and are left out" in loaded.notes[0]
+        for path in list((scene / "images").iterdir())[1:]:
+            path.unlink()
+        refused(scene, r"image r_.*\.png: image .*images/r_.*\.png not found \(nor 16 more of 18\)")
 
     def test_image_of_another_size(self, scene: Path) -> None:
         Image.new("RGBA", (SIZE, 12)).save(scene / "images/r_3.png")

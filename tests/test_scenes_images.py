@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from gridreg.errors import InputError
-from gridreg.scenes.images import area_mean, read_rgba
-from gridreg.scenes.png16 import decode_png16, is_png16
+from gridreg.scenes.images import area_mean, decode, read_rgba
 
 
 def paeth(a: int, b: int, c: int) -> int:
@@ -65,11 +64,14 @@ def png16_cases(draw: st.DrawFn) -> tuple[np.ndarray, list[int]]:
 
 @settings(max_examples=60)
 @given(png16_cases())
-def test_16_bit_png_keeps_all_its_bits(case: tuple[np.ndarray, list[int]]) -> None:
+def test_16_bit_png_keeps_all_its_bits(
+    tmp_path_factory: pytest.TempPathFactory, case: tuple[np.ndarray, list[int]]
+) -> None:
     pixels, filters = case
     data = encode_png16(pixels, filters)
-    assert is_png16(data)
-    np.testing.assert_array_equal(decode_png16(data), (pixels / 65535).astype(np.float32))
+    path = tmp_path_factory.mktemp("png16") / "a.png"
+    path.write_bytes(data)
+    np.testing.assert_array_equal(decode(path).pixels, (pixels / 65535).astype(np.float32))
     # Pillow keeps the high bytes: an independent reader of the same file.
     np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(data))), pixels >> 8)
 
@@ -79,7 +81,7 @@ def test_truncated_16_bit_png(tmp_path: Path, end: int) -> None:
     path = tmp_path / "a.png"
     pixels = np.random.default_rng(0).integers(0, 2**16, (8, 8, 4))
     path.write_bytes(encode_png16(pixels, [k % 5 for k in range(8)])[:end])
-    with pytest.raises(InputError, match=r"a\.png: not a whole image"):
+    with pytest.raises(InputError, match=r"a\.png: not (a whole image|an image that can be read)"):
         read_rgba(path)
 
 
@@ -92,15 +94,16 @@ def test_damaged_16_bit_png(tmp_path: Path) -> None:
         read_rgba(path)
 
 
-def test_unknown_row_filter() -> None:
+def test_unknown_row_filter(tmp_path: Path) -> None:
     data = encode_png16(np.zeros((1, 1, 4), dtype=int), [0])
     # The same image with the filter byte 9, built by hand.
     body = zlib.compress(bytes([9] + [0] * 8))
     start = data.index(b"IDAT") - 4
     chunk = struct.pack(">I", len(body)) + b"IDAT" + body + struct.pack(">I", zlib.crc32(b"IDAT" + body))
     end = struct.pack(">I", 0) + b"IEND" + struct.pack(">I", zlib.crc32(b"IEND"))
-    with pytest.raises(ValueError, match="unknown row filter 9"):
-        decode_png16(data[:start] + chunk + end)
+    (tmp_path / "a.png").write_bytes(data[:start] + chunk + end)
+    with pytest.raises(InputError, match=r"a\.png: not a whole image"):
+        read_rgba(tmp_path / "a.png")
 
 
 @pytest.mark.parametrize("kind", ["png", "webp"])
@@ -151,7 +154,9 @@ def test_truncated(tmp_path: Path, share: float, kind: str) -> None:
     Image.fromarray(pixels).save(path)
     data = path.read_bytes()
     path.write_bytes(data[: int(share * len(data))])
-    with pytest.raises(InputError, match=rf"a\.{kind}: not a whole image") as error:
+    with pytest.raises(
+        InputError, match=rf"a\.{kind}: not (a whole image|an image that can be read)"
+    ) as error:
         read_rgba(path, opaque=True)
     assert "\n" not in str(error.value)
 

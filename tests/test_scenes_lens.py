@@ -19,8 +19,9 @@ from gridreg.errors import InputError
 from gridreg.scenes import builtin_scene, load_scene
 from gridreg.scenes.builtin.cameras import look_at_origin
 from gridreg.scenes.builtin.raycast import render_rgba
-from gridreg.scenes.images import read_mask, read_rgba
+from gridreg.scenes.images import read_rgba
 from gridreg.scenes.lens import NO_DISTORTION, LensDistortion, undistort
+from gridreg.scenes.masks import read_mask
 
 small = st.floats(-0.08, 0.08)
 lenses = st.builds(
@@ -215,7 +216,7 @@ def test_masks(tmp_path: Path) -> None:
     for name in ("grey", "rgb", "rgba", "grey16"):
         np.testing.assert_allclose(read_mask(tmp_path / f"{name}.png"), [[0, 0.2, 1]], atol=1e-6)
     (tmp_path / "grey.png").write_bytes(b"no")
-    with pytest.raises(InputError, match=r"grey\.png: not a whole image"):
+    with pytest.raises(InputError, match=r"grey\.png: not an image that can be read"):
         read_mask(tmp_path / "grey.png")
 
 

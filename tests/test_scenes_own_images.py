@@ -127,10 +127,11 @@ class TestImages:
     def test_none(self, tmp_path: Path) -> None:
         (tmp_path / "empty").mkdir()
         refused(tmp_path / "empty", tmp_path / "out", r"empty: found nothing, expected images")
-        (tmp_path / "empty/a.HEIC").write_text("")
+        (tmp_path / "empty/a.MOV").write_text("")
+        (tmp_path / "empty/.hidden.png").write_text("")
         (tmp_path / "empty/notes.txt").write_text("")
         refused(
-            tmp_path / "empty", tmp_path / "out", r"found only \.HEIC, \.txt files, expected images \(\.jpg"
+            tmp_path / "empty", tmp_path / "out", r"found only \.MOV, \.txt files, expected images \(\.jpg"
         )
 
     def test_three(self, images: Path, tmp_path: Path) -> None:

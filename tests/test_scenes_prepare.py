@@ -16,6 +16,7 @@ from gridreg.errors import InputError
 from gridreg.scenes import builtin_scene, load_scene, prepare
 from gridreg.scenes.builtin.cameras import look_at_origin
 from gridreg.scenes.drawing import draw_cameras
+from gridreg.scenes.images import read_rgba
 from gridreg.scenes.prepare import _upwards
 
 SIZE = 16
@@ -92,7 +93,8 @@ class TestFromCameras:
     def test_keeps_lenses_and_masks(self, posed: Path, tmp_path: Path) -> None:
         content = json.loads((posed / "transforms.json").read_text())
         content.update(fl_x=21.0, fl_y=22.0, cx=8.5, cy=7.5, w=SIZE, h=SIZE, k1=0.1, p2=0.01)
-        content["frames"][3]["mask_path"] = "images/r_5.png"
+        for k, frame in enumerate(content["frames"]):
+            frame["mask_path"] = f"images/r_{5 if k == 3 else k}.png"
         content["frames"][4]["fl_x"] = 23.0
         (posed / "transforms.json").write_text(json.dumps(content))
         prepare(posed, tmp_path / "out")
@@ -129,10 +131,16 @@ class TestFromCameras:
     def test_a_folder_of_masks(self, posed: Path, tmp_path: Path) -> None:
         (tmp_path / "masks").mkdir()
         for k in range(18):
-            Image.new("L", (SIZE, SIZE), 51 if k == 3 else 255).save(tmp_path / f"masks/r_{k}.png")
+            mask = Image.new("L", (SIZE, SIZE), 255)
+            mask.paste(51 if k == 3 else 255, (SIZE // 2, 0, SIZE // 2 + 2, SIZE))
+            mask.save(tmp_path / f"masks/r_{k}.png")
         prepare(posed, tmp_path / "out", masks=tmp_path / "masks")
         views = load_scene(tmp_path / "out", "holdout8").train
-        assert float(views.rgba[views.names.index("r_3"), ..., 3].max()) == pytest.approx(0.2)
+        # A soft edge two pixels wide stays one.
+        edge = views.rgba[:, :, SIZE // 2 : SIZE // 2 + 2, 3]
+        for name, factor in (("r_3", 0.2), ("r_5", 1.0)):
+            alpha = read_rgba(posed / f"images/{name}.png")[:, SIZE // 2 : SIZE // 2 + 2, 3]
+            np.testing.assert_allclose(edge[views.names.index(name)], factor * alpha, rtol=1e-6)
         (tmp_path / "masks/r_9.png").unlink()
         refused(posed, tmp_path / "again", r"no mask for image r_9\.png", masks=tmp_path / "masks")
 

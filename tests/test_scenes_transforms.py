@@ -106,6 +106,11 @@ def test_masks_named_by_the_frames(scene: Path) -> None:
     (scene / "masks").mkdir()
     Image.new("L", (SIZE, SIZE), 0).save(scene / "masks/none.png")
     edit(scene, lambda c: c["frames"][1].update(mask_path="masks/none.png"))
+    refused(
+        scene, r"transforms\.json: frame 2: has no mask, others have; expected one for every frame, or none"
+    )
+    Image.new("L", (SIZE, SIZE), 255).save(scene / "masks/all.png")
+    edit(scene, lambda c: [frame.setdefault("mask_path", "masks/all.png") for frame in c["frames"]])
     loaded = load_scene(scene, "holdout8")
     assert bool((loaded.train.rgba[0, ..., 3] == 0).all())
     assert bool((loaded.train.rgba[1, ..., 3] > 0).any())
@@ -162,7 +167,9 @@ class TestBox:
 
     @pytest.mark.parametrize("half", [1e-3, 0.1, 1.5, 50.0])
     def test_small_and_large_ones_are_seen(self, scene: Path, half: float) -> None:
-        assert load_scene(scene, "holdout8", bounds=[[-half] * 3, [half] * 3]).far == 6
+        # Who states a box counts in the world of the files, however large: it stays.
+        loaded = load_scene(scene, "holdout8", bounds=[[-half] * 3, [half] * 3])
+        assert (loaded.far, loaded.bounds[1].tolist()) == (6, [pytest.approx(half)] * 3)
 
 
 class TestFocus:

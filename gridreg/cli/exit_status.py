@@ -21,6 +21,8 @@ def run_cli(program: Callable[[], int]) -> int:
         >>> run_cli(lambda: 0)
         0
     """
+    # Nothing here draws on a screen; what a notebook sets for its own process is often not installed beside us.
+    os.environ["MPLBACKEND"] = "agg"
     try:
         status = program()
         sys.stdout.flush()

@@ -11,7 +11,7 @@ import torch
 
 from gridreg.errors import InputError
 from gridreg.export.cameras import Camera, Lens
-from gridreg.scenes.frames import check_pose
+from gridreg.scenes.gate import check_pose
 from gridreg.training.files import write_json
 
 __all__ = ["load_cameras", "save_cameras"]

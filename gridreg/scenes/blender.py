@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import Any
 
 from gridreg.errors import InputError
-from gridreg.scenes.frames import Frame, SceneFiles, StatedIntrinsics, check_pose
+from gridreg.scenes.files import find_inside, read_json
+from gridreg.scenes.frames import Frame, SceneFiles, StatedIntrinsics
+from gridreg.scenes.gate import check_pose
 from gridreg.scenes.lens import LensDistortion
 
-__all__ = ["read_blender", "read_camera", "read_frames", "read_json"]
+__all__ = ["read_blender", "read_camera", "read_frames"]
 
 _DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _LENSES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "FULL_OPENCV", "PERSPECTIVE")
@@ -20,34 +21,28 @@ _LENSES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "FU
 def read_blender(folder: Path) -> SceneFiles:
     """Read ``transforms_train.json`` and ``transforms_test.json`` without opening an image.
 
-    ``camera_angle_y`` is ignored: BlenderNeRF derives it from the sensor's height, which does not fit images
-    of another aspect; ``fl_x`` and ``fl_y`` count, and square pixels are assumed where they are missing.
+    Where no test images are (BlenderNeRF exports cameras of test views alone), ``transforms_val.json`` serves
+    instead, or every eighth training frame is held out; a note says so. ``camera_angle_y`` is ignored:
+    BlenderNeRF derives it from the sensor's height, which does not fit images of another aspect; ``fl_x`` and
+    ``fl_y`` count, and square pixels are assumed where they are missing.
 
     Raises:
         InputError: for a missing file or key, a number that is not one, or a pose that is not rigid.
     """
-    sources = {split: folder / f"transforms_{split}.json" for split in ("train", "test")}
-    lists = {split: read_frames(path, read_json(path)) for split, path in sources.items()}
-    return SceneFiles(folder, lists["train"], lists["test"], sources)
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON object.
-
-    Raises:
-        InputError: when the file is missing, is not JSON or holds something else.
-    """
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{path}: file not found") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not valid JSON ({' '.join(str(error).split())})") from None
-    if not isinstance(content, dict):
-        raise InputError(f"{path}: found a {type(content).__name__}, expected a JSON object")
-    return content
+    source = folder / "transforms_train.json"
+    train = read_frames(source, read_json(source))
+    notes: tuple[str, ...] = ()
+    tests = [folder / f"transforms_{split}.json" for split in ("test", "val")]
+    for path in (path for path in tests if path.exists()):
+        content = read_json(path)
+        test = read_frames(path, content) if content.get("frames") != [] else []
+        if any(find_inside(folder, frame.file_path, frame.where) for frame in test):
+            return SceneFiles(folder, train, test, {"train": source, "test": path}, notes=notes)
+        notes += (f"{path}: lists {len(test)} frames and none of their images is there",)
+    if not notes:
+        raise InputError(f"{tests[0]}: file not found")
+    held = f"every 8th frame of {source} is held out instead"
+    return SceneFiles.held_out(folder, train, source, notes=(f"{'; '.join(notes)}; {held}",))
 
 
 def read_frames(path: Path, content: dict[str, Any]) -> list[Frame]:
@@ -73,6 +68,8 @@ def _read_frame(shared: dict[str, Any], entry: object, where: str) -> Frame:
     if not isinstance(entry["file_path"], str):
         raise InputError(f"{where}: file_path is a {type(entry['file_path']).__name__}, expected a string")
     # A frame's own intrinsics win over those of the file.
+    if "fl_x" in entry:
+        shared = {key: value for key, value in shared.items() if key != "camera_angle_x"}
     camera = read_camera({**shared, **entry}, where)
     mask_path = entry.get("mask_path")
     if mask_path is not None and not isinstance(mask_path, str):
@@ -102,16 +99,16 @@ def read_camera(values: dict[str, Any], where: str) -> StatedIntrinsics:
             raise InputError(f"{where}: {key} is {focal}, expected a positive number of pixels")
     width, height = _number(values, "w", where), _number(values, "h", where)
     for key, edge in (("w", width), ("h", height)):
-        if edge is not None and (edge < 1 or edge != round(edge)):
-            raise InputError(f"{where}: {key} is {edge}, expected a whole number of pixels")
+        if edge is not None and edge < 1:
+            raise InputError(f"{where}: {key} is {edge}, expected a positive number of pixels")
     return StatedIntrinsics(
         angle_x=angle,
         fx=fx,
         fy=fy,
         cx=_number(values, "cx", where),
         cy=_number(values, "cy", where),
-        width=None if width is None else int(width),
-        height=None if height is None else int(height),
+        width=_whole(width),
+        height=_whole(height),
         distortion=distortion,
     )
 
@@ -124,3 +121,8 @@ def _number(values: dict[str, Any], key: str, where: str) -> float | None:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e100:
         raise InputError(f"{where}: {key} is {str(value)[:40]!r}, expected a finite number")
     return float(value)
+
+
+def _whole(edge: float | None) -> float | None:
+    """Return whole numbers as integers: the text of a fingerprint has them so."""
+    return int(edge) if edge is not None and edge == round(edge) else edge

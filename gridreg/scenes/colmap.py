@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 
 from gridreg.errors import InputError
 from gridreg.scenes.colmap_model import ColmapCamera, ColmapImage, ColmapModel, read_model
-from gridreg.scenes.frames import Frame, SceneFiles, StatedIntrinsics, check_pose
+from gridreg.scenes.files import read_text
+from gridreg.scenes.frames import Frame, SceneFiles, StatedIntrinsics
+from gridreg.scenes.gate import check_pose
 from gridreg.scenes.lens import LensDistortion
 
 __all__ = ["camera_to_world", "find_models", "frames_of_model", "mask_of", "read_colmap"]
@@ -36,8 +38,9 @@ def _is_model(folder: Path) -> bool:
 def read_colmap(folder: Path) -> SceneFiles:
     """Read a COLMAP model beside ``images/`` (and, if there, ``masks/``) without opening an image.
 
-    World coordinates are those of the model; every eighth image by name is held out for testing. A mask is
-    called like its image, with the same extension or ``.png``, or like its image with ``.png`` appended.
+    World coordinates are those of the model. The images that ``test.txt`` names in the model's folder are for
+    testing (as 3D Gaussian splatting has it), else every eighth by name. A mask is called like its image,
+    with the same extension or ``.png``, or like its image with ``.png`` appended.
 
     Raises:
         InputError: when there is more than one model, or it or its images cannot be read.
@@ -51,10 +54,16 @@ def read_colmap(folder: Path) -> SceneFiles:
     if images is None:
         raise InputError(f"{folder}: folder images/ with the images of the COLMAP model not found")
     frames = frames_of_model(model, folder, images, str(models[0]))
+    split, test = models[0] / "test.txt", set[str]()
+    if split.is_file():
+        names = {name.strip() for name in read_text(split).splitlines()}
+        test = {frame.file_path for frame in frames if frame.file_path.removeprefix(f"{images}/") in names}
     return SceneFiles.held_out(
         folder,
         frames,
         models[0],
+        test=test,
+        notes=(f"{split}: {len(test)} test frames",) if test else (),
         opaque=True,
         as_stored=True,
         points=model.points if len(model.points) else None,

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridreg.errors import InputError
+from gridreg.scenes.files import read_bytes, read_text
 
 __all__ = ["ColmapCamera", "ColmapImage", "ColmapModel", "read_model"]
 
@@ -68,23 +69,17 @@ def read_model(folder: Path) -> ColmapModel:
     suffix = ".bin" if binary else ".txt"
     cameras_file, images_file = folder / f"cameras{suffix}", folder / f"images{suffix}"
     points_file = folder / f"points3D{suffix}"
+    current = cameras_file
     try:
-        current = cameras_file
         cameras = dict((_binary_cameras if binary else _text_cameras)(cameras_file))
         current = images_file
         images = list((_binary_images if binary else _text_images)(images_file))
         current = points_file
         points = list((_binary_points if binary else _text_points)(points_file))
-    except FileNotFoundError:
-        raise InputError(f"{current}: file not found") from None
-    except OSError as error:
-        raise InputError(f"{current}: cannot be read ({error.strerror})") from None
     except (ValueError, IndexError, struct.error, OverflowError) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(
-            f"{current}: not a COLMAP file, or cut short ({' '.join(str(error).split())})"
-        ) from None
+        raise InputError(f"{current}: not a COLMAP file, or cut short ({error})") from None
     if not images:
         raise InputError(f"{images_file}: holds no registered image")
     for image in images:
@@ -92,8 +87,11 @@ def read_model(folder: Path) -> ColmapModel:
             raise InputError(
                 f"{images_file}: image {image.name!r} has camera {image.camera_id}, not in {cameras_file}"
             )
+    placed = np.array(points, dtype=np.float64).reshape(-1, 3)
+    if not (np.abs(placed) < 1e18).all():
+        raise InputError(f"{points_file}: holds a point that is not finite, or too large for float32")
     ordered = tuple(sorted(images, key=lambda image: image.name))
-    return ColmapModel(cameras, ordered, np.array(points, dtype=np.float64).reshape(-1, 3))
+    return ColmapModel(cameras, ordered, placed)
 
 
 def _camera(model: str, width: int, height: int, values: list[float], path: Path) -> ColmapCamera:
@@ -111,32 +109,44 @@ def _camera(model: str, width: int, height: int, values: list[float], path: Path
     return ColmapCamera(model, width, height, dict(zip(names, values, strict=True)))
 
 
-def _lines(path: Path) -> Iterator[list[str]]:
-    """Yield the fields of every line that is no comment; empty lines matter in ``images.txt``."""
-    for line in path.read_text(encoding="utf-8").splitlines():
-        if not line.startswith("#"):
-            yield line.split()
+def _lines(path: Path) -> Iterator[str]:
+    """Yield every line that is no comment, also empty ones: they matter in ``images.txt``."""
+    yield from (line for line in read_text(path).splitlines() if not line.startswith("#"))
 
 
 def _text_cameras(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
-    for fields in _lines(path):
-        if fields:
-            values = [float(value) for value in fields[4:]]
-            yield int(fields[0]), _camera(fields[1], int(fields[2]), int(fields[3]), values, path)
+    for fields in filter(None, map(str.split, _lines(path))):
+        values = [float(value) for value in fields[4:]]
+        yield int(fields[0]), _camera(fields[1], int(fields[2]), int(fields[3]), values, path)
 
 
 def _text_images(path: Path) -> Iterator[ColmapImage]:
-    # Every image has two lines, and the second one, its observations, may be empty.
-    for fields in list(_lines(path))[0::2]:
-        if fields:
-            w, x, y, z, *translation = (float(value) for value in fields[1:8])
-            yield ColmapImage(" ".join(fields[9:]), int(fields[8]), (w, x, y, z), _triple(translation))
+    # Every image has two lines. The second one, its observations, may be empty; files of known poses often
+    # lack it.
+    awaited = False
+    for line in _lines(path):
+        if awaited and _are_observations(line):
+            awaited = False
+        elif line.strip():
+            # The name is the rest of the line: it may hold spaces.
+            *numbers, name = line.split(maxsplit=9)
+            w, x, y, z, *translation = (float(value) for value in numbers[1:8])
+            yield ColmapImage(name.rstrip(), int(numbers[8]), (w, x, y, z), _triple(translation))
+            awaited = True
+
+
+def _are_observations(line: str) -> bool:
+    """Tell whether a line holds triples of numbers, or nothing; an image's name makes it another line."""
+    fields = line.split()
+    try:
+        return len(fields) % 3 == 0 and bool(np.isfinite([float(field) for field in fields]).all())
+    except ValueError:
+        return False
 
 
 def _text_points(path: Path) -> Iterator[tuple[float, float, float]]:
-    for fields in _lines(path):
-        if fields:
-            yield _triple([float(value) for value in fields[1:4]])
+    for fields in filter(None, map(str.split, _lines(path))):
+        yield _triple([float(value) for value in fields[1:4]])
 
 
 def _triple(values: list[float]) -> tuple[float, float, float]:
@@ -148,7 +158,7 @@ class _Bytes:
     """A little-endian file, read from front to back."""
 
     def __init__(self, path: Path) -> None:
-        self._data, self._position = path.read_bytes(), 0
+        self._data, self._position = read_bytes(path), 0
 
     def take(self, form: str) -> tuple[float, ...]:
         values = struct.unpack_from("<" + form, self._data, self._position)

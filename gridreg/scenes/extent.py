@@ -8,17 +8,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridreg.errors import InputError
-from gridreg.scenes.views import Scene
+from gridreg.scenes.views import IN_PLACE, Scene, World
 
 __all__ = [
+    "ADVICE",
+    "HALF_EDGE",
     "Extent",
     "blender_extent",
     "box_is_seen",
     "camera_extent",
+    "centred",
     "check_box",
     "focus_point",
     "points_extent",
+    "settled",
 ]
+
+
+ADVICE = "give bounds, near and far (gridreg prepare with --box, --near and --far)"
+"""Way out for cameras from which no box follows."""
+
+HALF_EDGE = 1.3
+"""Half the edge of the box, in units of the scene, at which the presets are at home."""
 
 
 class Extent(NamedTuple):
@@ -61,8 +72,7 @@ def camera_extent(
     behind = int((depth <= 1e-6).sum())
     if behind:
         raise InputError(
-            f"cameras: {behind} of {len(poses)} look away from the point that the "
-            "others look at; give bounds, near and far"
+            f"cameras: {behind} of {len(poses)} look away from the point that the others look at; {ADVICE}"
         )
     half = float((depth * 0.5 * np.maximum(size[0] / intrinsics[:, 0], size[1] / intrinsics[:, 1])).max())
     distance = np.linalg.norm(centre - poses[:, :3, 3], axis=-1)
@@ -108,12 +118,45 @@ def points_extent(poses: NDArray[np.float64], points: NDArray[np.float64]) -> Ex
     margin = max(0.2 * float((high - low).max()), 0.01 * float(apart.max()))
     bounds = np.stack([low - margin, high + margin])
     inside = points[((points >= bounds[0]) & (points <= bounds[1])).all(axis=1)]
-    offset = inside[None] - poses[:, None, :3, 3]
-    before = (offset * -poses[:, None, :3, 2]).sum(axis=-1) > 0
-    distance = np.linalg.norm(offset, axis=-1)[before]
-    if not len(distance):
-        raise InputError("cameras: none has a point of the model before it; give bounds, near and far")
-    return Extent(0.9 * float(np.quantile(distance, 0.001)), 1.1 * float(distance.max()), bounds)
+    # One camera after the other, and of all distances the smallest alone: pairs of points and cameras fill
+    # the memory.
+    few = int(0.001 * len(inside) * len(poses)) + 2
+    smallest, largest, count = np.empty(0), 0.0, 0
+    for pose in poses:
+        offset = inside - pose[:3, 3]
+        distance = np.linalg.norm(offset, axis=-1)[(offset * -pose[:3, 2]).sum(axis=-1) > 0]
+        count, largest = count + len(distance), max(largest, float(distance.max(initial=0.0)))
+        smallest = np.sort(np.concatenate([smallest, distance]))[:few]
+    if not count:
+        raise InputError(f"cameras: none has a point of the model before it; {ADVICE}")
+    # The quantile 0.001 of them all, as np.quantile interpolates it.
+    below, fraction = divmod(0.001 * (count - 1), 1)
+    low, high = smallest[int(below)], smallest[min(int(below) + 1, count - 1)]
+    return Extent(0.9 * float(low + (high - low) * fraction), 1.1 * largest, bounds)
+
+
+def settled(extent: Extent) -> tuple[World, Extent]:
+    """Return the world in which an extent is at home, and the extent there.
+
+    A box about as large as those of the presets, and about the origin, stays where it is, bit for bit; any
+    other is :func:`centred`.
+    """
+    middle = extent.bounds.mean(axis=0)
+    half = float((extent.bounds[1] - middle).max())
+    at_home = HALF_EDGE / 2 <= half <= 2 * HALF_EDGE and float(np.abs(middle).max()) <= half
+    return (IN_PLACE, extent) if at_home else centred(extent)
+
+
+def centred(extent: Extent) -> tuple[World, Extent]:
+    """Return the world whose origin is a box's middle and in which the box reaches 1.3, and the extent
+    there."""
+    x, y, z = extent.bounds.mean(axis=0).tolist()
+    unit = float((extent.bounds[1] - (x, y, z)).max()) / HALF_EDGE
+    if not 0 < unit < np.inf:
+        return IN_PLACE, extent
+    return World((x, y, z), unit), Extent(
+        extent.near / unit, extent.far / unit, (extent.bounds - (x, y, z)) / unit
+    )
 
 
 def check_box(scene: Scene, points: NDArray[np.float64] | None = None) -> None:

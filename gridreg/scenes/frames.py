@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,11 +13,10 @@ from numpy.typing import NDArray
 
 from gridreg.errors import InputError
 from gridreg.scenes.extent import Extent
+from gridreg.scenes.files import find_inside
 from gridreg.scenes.lens import NO_DISTORTION, LensDistortion
 
-__all__ = ["StatedIntrinsics", "Frame", "SceneFiles", "check_pose", "resolve_inside"]
-
-_EXTENSIONS = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
+__all__ = ["Frame", "SceneFiles", "StatedIntrinsics"]
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,8 @@ class StatedIntrinsics:
         angle_x: horizontal field of view in radians, used when ``fx`` is not given.
         fx, fy: focal lengths in pixels; ``fy`` defaults to ``fx``.
         cx, cy: principal point in pixels; defaults to the image's centre.
-        width, height: size in pixels, checked against the image when given.
+        width, height: size in pixels, checked against the image when given; a fraction of a pixel is left
+            aside.
         distortion: of the lens.
     """
 
@@ -36,18 +37,19 @@ class StatedIntrinsics:
     fy: float | None = None
     cx: float | None = None
     cy: float | None = None
-    width: int | None = None
-    height: int | None = None
+    width: float | None = None
+    height: float | None = None
     distortion: LensDistortion = NO_DISTORTION
 
     @property
-    def size(self) -> tuple[int, int] | None:
+    def size(self) -> tuple[float, float] | None:
         """Width and height, when both are given."""
         return None if self.width is None or self.height is None else (self.width, self.height)
 
     @property
     def fingerprint(self) -> str:
-        """Text that stands for these intrinsics in a scene's fingerprint; checkpoints hold it, so it never changes."""
+        """Text that stands for these intrinsics in a scene's fingerprint; checkpoints hold it, so it never
+        changes."""
         text = str(self).replace("LensDistortion(", "Distortion(")
         return text.replace("StatedIntrinsics(", "Camera(")
 
@@ -58,6 +60,13 @@ class StatedIntrinsics:
             if self.angle_x is None:
                 raise InputError("camera: neither fl_x nor camera_angle_x is given")
             fx = 0.5 * width / math.tan(0.5 * self.angle_x)
+        elif self.angle_x is not None and self.width is None:
+            meant = 2 * fx * math.tan(0.5 * self.angle_x)
+            if abs(meant - width) > 0.05 * width:
+                raise InputError(
+                    f"camera: fl_x and camera_angle_x belong to images {meant:.0f} wide, found {width} "
+                    "(intrinsics of another size?)"
+                )
         fy = fx if self.fy is None else self.fy
         cx = 0.5 * width if self.cx is None else self.cx
         cy = 0.5 * height if self.cy is None else self.cy
@@ -98,6 +107,8 @@ class SceneFiles:
         extent: near, far and box, where the format states them.
         ndc: whether rays are to be mapped to normalised device coordinates.
         split_here: whether the format has one list and the test frames were held out of it by this reader.
+        own_split: whether the files name the test frames themselves.
+        notes: what a user should know about how the files were understood, a line each.
     """
 
     folder: Path
@@ -110,68 +121,64 @@ class SceneFiles:
     extent: Extent | None = None
     ndc: bool = False
     split_here: bool = False
+    own_split: bool = False
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        without = [frame for frame in (*self.train, *self.test) if frame.mask_path is None]
+        if 0 < len(without) < len(self.train) + len(self.test):
+            raise InputError(
+                f"{without[0].where}: has no mask, others have; expected one for every frame, or none"
+            )
 
     @staticmethod
-    def held_out(folder: Path, frames: list[Frame], source: Path, **options: Any) -> SceneFiles:
+    def held_out(
+        folder: Path,
+        frames: list[Frame],
+        source: Path,
+        *,
+        test: Collection[str] = (),
+        notes: tuple[str, ...] = (),
+        **options: Any,
+    ) -> SceneFiles:
         """Split one list: every eighth frame from the first is for testing (LLFF's convention), the others
         train.
 
+        Frames whose images are not there are left out, and a note says so.
+
+        Args:
+            folder: the scene folder.
+            frames: the list.
+            source: the file that it comes from.
+            test: paths of the frames to hold out instead of every eighth.
+            notes: what there is to say already.
+            options: further attributes.
+
         Raises:
-            InputError: for fewer than two frames.
+            InputError: for fewer than two frames with images, or no frame left on one side.
         """
+        missing = [frame for frame in frames if find_inside(folder, frame.file_path, frame.where) is None]
+        if missing:
+            example = f"image {folder / missing[0].file_path} not found"
+            if len(missing) > len(frames) - 2:
+                raise InputError(
+                    f"{missing[0].where}: {example} (nor {len(missing) - 1} more of {len(frames)})"
+                )
+            notes += (
+                f"{source}: {len(missing)} of {len(frames)} frames have no image and are left out ({example})",
+            )
+            gone = {id(frame) for frame in missing}
+            frames = [frame for frame in frames if id(frame) not in gone]
         if len(frames) < 2:
             raise InputError(f"{source}: found {len(frames)} frames, expected at least 2 (one is held out)")
-        train = [frame for i, frame in enumerate(frames) if i % 8]
+        held = [frame.file_path in test if test else i % 8 == 0 for i, frame in enumerate(frames)]
+        train = [frame for frame, out in zip(frames, held, strict=True) if not out]
+        rest = [frame for frame, out in zip(frames, held, strict=True) if out]
+        if not train or not rest:
+            raise InputError(
+                f"{source}: its own split leaves {len(train)} training and {len(rest)} test frames with images"
+            )
+        sources = {"train": source, "test": source}
         return SceneFiles(
-            folder, train, frames[::8], {"train": source, "test": source}, split_here=True, **options
+            folder, train, rest, sources, split_here=True, own_split=bool(test), notes=notes, **options
         )
-
-
-def check_pose(matrix: object, where: str) -> NDArray[np.float64]:
-    """Return a camera-to-world matrix as ``(4, 4)`` float64, or say what is wrong with it.
-
-    Raises:
-        InputError: unless it is 4x4 (or 3x4) numbers, finite, with a rotation and the last row 0 0 0 1.
-    """
-    try:
-        pose = np.array(matrix, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        raise InputError(f"{where}: transform_matrix is not a 4x4 matrix of numbers") from None
-    if pose.shape == (3, 4):
-        pose = np.concatenate([pose, [[0.0, 0.0, 0.0, 1.0]]])
-    if pose.shape != (4, 4):
-        raise InputError(f"{where}: transform_matrix has shape {pose.shape}, expected (4, 4)")
-    if not np.isfinite(pose).all():
-        raise InputError(f"{where}: transform_matrix holds a number that is not finite")
-    rotation = pose[:3, :3]
-    if np.abs(rotation).max() > 2 or np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-3:
-        raise InputError(f"{where}: transform_matrix is not rigid, expected a rotation in its upper left 3x3")
-    if np.linalg.det(rotation) < 0:
-        raise InputError(f"{where}: transform_matrix mirrors, expected a rotation in its upper left 3x3")
-    if np.abs(pose[3] - [0, 0, 0, 1]).max() > 1e-6:
-        raise InputError(f"{where}: transform_matrix has the last row {pose[3].tolist()}, expected 0 0 0 1")
-    return pose
-
-
-def resolve_inside(folder: Path, file_path: str, where: str) -> Path:
-    """Find the file that a frame names, with or without extension, inside ``folder`` and nowhere else.
-
-    Raises:
-        InputError: when there is no such file, or it lies outside the folder, symbolic links followed.
-    """
-    stated = Path(file_path)
-    root = folder.resolve()
-    if not file_path or "\0" in file_path or stated.is_absolute():
-        raise InputError(f"{where}: file_path {file_path!r} is not a path relative to the scene folder")
-    candidates = [root / stated, *(root / f"{file_path}{extension}" for extension in _EXTENSIONS)]
-    for candidate in candidates:
-        try:
-            resolved = candidate.resolve()
-            # Containment comes first: a path that climbs out must not even tell whether something is there.
-            if not resolved.is_relative_to(root):
-                raise InputError(f"{where}: file_path {file_path!r} leads out of the scene folder {folder}")
-            if resolved.is_file():
-                return resolved
-        except (OSError, RuntimeError):
-            raise InputError(f"{where}: file_path {file_path!r} cannot be followed") from None
-    raise InputError(f"{where}: image {folder / stated} not found")

@@ -1,4 +1,8 @@
-"""Reading images into straight-alpha RGBA, and reducing them by area means."""
+"""Reading images into straight-alpha RGBA, and reducing them by area means.
+
+Everything that is opened as an image is opened here: in the formats that are meant, within bounds that are
+asked before anything is unpacked, and with every decoder's exception turned into one line.
+"""
 
 from __future__ import annotations
 
@@ -6,27 +10,29 @@ import io
 import struct
 import warnings
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import ExifTags, Image
+from PIL import ExifTags, Image, ImageFile, UnidentifiedImageError
 
 from gridreg.errors import InputError
-from gridreg.scenes.png16 import decode_png16, is_png16
+from gridreg.memory import check_memory
+from gridreg.scenes.files import read_bytes
 
-__all__ = ["area_mean", "copy_upright", "read_mask", "read_rgba", "upright"]
+__all__ = ["Decoded", "area_mean", "copy_upright", "decode", "image_size", "open_image", "read_rgba"]
 
-_DECODER_ERRORS = (
-    OSError,
-    SyntaxError,
-    ValueError,
-    EOFError,
-    struct.error,
-    zlib.error,
-    Image.DecompressionBombError,
-)
-_ORIENTATION = 274
+FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "AVIF", "HEIF")
+"""Pillow's names of the formats that are opened, whatever a file is called."""
+
+MOST_PIXELS = 2**27
+"""Larger images are refused before they are unpacked; the largest telephones take 200 million pixels,
+rarely."""
+
+_MOST_SCANS = 100
 _TURNS = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,
@@ -36,166 +42,259 @@ _TURNS = {
     7: Image.Transpose.TRANSVERSE,
     8: Image.Transpose.ROTATE_90,
 }
+SIDEWAYS = (_TURNS[5], _TURNS[6], _TURNS[7], _TURNS[8])
+"""Turns that swap width and height."""
+
+
+class Decoded(NamedTuple):
+    """An image as its camera saw it.
+
+    Attributes:
+        pixels: ``(H, W, 3)`` or ``(H, W, 4)`` float32 in [0, 1], straight alpha, whichever the file holds.
+        turn: how the stored pixels were turned, as EXIF data say; None: not at all.
+    """
+
+    pixels: NDArray[np.float32]
+    turn: Image.Transpose | None
 
 
 def read_rgba(
-    path: Path, *, opaque: bool = False, stated: tuple[int, int] | None = None, as_stored: bool = False
+    path: Path, *, opaque: bool = False, stated: tuple[float, float] | None = None, as_stored: bool = False
 ) -> NDArray[np.float32]:
-    """Read a PNG or JPEG (or anything else Pillow knows) as float RGBA, turned upright as its EXIF data say.
+    """Read an image as float RGBA, see :func:`decode`.
 
     Args:
         path: the file.
         opaque: give images without alpha an alpha of 1 instead of refusing them.
-        stated: width and height of the camera: where EXIF would swap the two, they say whether to turn.
-        as_stored: do not turn the image where the size does not tell.
+        stated: see :func:`decode`.
+        as_stored: see :func:`decode`.
 
     Returns:
         ``(H, W, 4)`` float32 in [0, 1] with straight alpha.
 
     Raises:
-        InputError: when the file is missing, cannot be decoded, has no alpha channel or broken EXIF data.
+        InputError: as :func:`decode`, and when the image has no alpha channel.
     """
-    data = _read_bytes(path)
-    try:
-        rgba = decode_png16(data) if is_png16(data) else _decode(data, path, stated, as_stored)
-    except _DECODER_ERRORS as error:
-        raise _not_whole(path, error) from None
-    if rgba.shape[-1] == 3:
-        if not opaque:
-            raise InputError(f"{path}: image has no alpha channel, expected RGBA")
-        rgba = np.concatenate([rgba, np.ones_like(rgba[..., :1])], axis=-1)
-    return rgba
+    pixels = decode(path, stated=stated, as_stored=as_stored).pixels
+    if pixels.shape[-1] == 4:
+        return pixels
+    if not opaque:
+        raise InputError(f"{path}: image has no alpha channel, expected RGBA")
+    return np.concatenate([pixels, np.ones_like(pixels[..., :1])], axis=-1)
 
 
-def read_mask(path: Path) -> NDArray[np.float32]:
-    """Read a mask: white (or opaque, where it has alpha) is kept, black is background.
+def decode(path: Path, *, stated: tuple[float, float] | None = None, as_stored: bool = False) -> Decoded:
+    """Read a PNG, JPEG, WebP, TIFF, BMP, AVIF or (with pillow-heif) HEIC, turned upright as its EXIF data
+    say.
 
-    Returns:
-        ``(H, W)`` float32 in [0, 1].
+    Args:
+        path: the file.
+        stated: width and height of the camera: where EXIF would swap the two, they say whether to turn.
+        as_stored: do not turn the image where the size does not tell.
 
     Raises:
-        InputError: when the file is missing or cannot be decoded.
+        InputError: when the file is missing, cannot be decoded, is too large, or has broken EXIF data.
     """
-    data = _read_bytes(path)
+    with open_image(path) as image:
+        low = _low_bytes(image, read_bytes(path, "image"))
+        # Pillow reads a PNG to its end to find EXIF data: a cut image has to fail before.
+        image.load()
+        turn = _turn(image, path, stated, as_stored)
+        if turn is not None:
+            image, low = image.transpose(turn), None if low is None else low.transpose(turn)
+        return Decoded(_values(image, low, path), turn)
+
+
+@contextmanager
+def open_image(path: Path) -> Iterator[Image.Image]:
+    """Open an image; what its decoder raises, then or while the block reads pixels, becomes an `InputError`."""
+    data = read_bytes(path, "image")
     try:
-        with Image.open(io.BytesIO(data)) as image:
-            if image.has_transparency_data:
-                grey = image.convert("RGBA").getchannel("A")
-            elif image.mode.startswith("I;16"):
-                grey = Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
-            else:
-                grey = image.convert("L")
-            mask: NDArray[np.float32] = np.divide(np.asarray(grey), 255, dtype=np.float32)
-            return mask
-    except _DECODER_ERRORS as error:
+        # Without Pillow's own words on broken EXIF data: `_turn` refuses them in one line.
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            _enable_heif(data, path)
+            Image.init()
+            image = Image.open(io.BytesIO(data), formats=[name for name in FORMATS if name in Image.OPEN])
+    except InputError:
+        raise
+    except UnidentifiedImageError:
+        known = "PNG, JPEG, WebP, TIFF, BMP, AVIF or HEIC"
+        raise InputError(f"{path}: not an image that can be read, expected a whole {known}") from None
+    except Exception as error:
         raise _not_whole(path, error) from None
+    with image:
+        if image.width * image.height > MOST_PIXELS:
+            raise InputError(
+                f"{path}: image is {image.width}x{image.height}, expected at most {MOST_PIXELS:,} pixels"
+            )
+        # Bytes, their copy as floats, and one copy more while they are turned or reduced.
+        check_memory(40 * image.width * image.height, f"{path}: image is {image.width}x{image.height},")
+        try:
+            _check_data(data, image.format)
+            yield image
+        except InputError:
+            raise
+        except Exception as error:
+            raise _not_whole(path, error) from None
 
 
-def upright(image: Image.Image, path: Path) -> int:
-    """Return the EXIF orientation of an opened image: 1 is upright, 5 to 8 swap width and height.
+def image_size(path: Path) -> tuple[int, int]:
+    """Return width and height as stored, from the header alone.
 
     Raises:
-        InputError: for EXIF data that cannot be read.
+        InputError: as :func:`open_image`.
     """
+    with open_image(path) as image:
+        return image.size
+
+
+def _enable_heif(data: bytes, path: Path) -> None:
+    if data[4:8] != b"ftyp" or data[8:12] in (b"avif", b"avis"):
+        return
+    try:
+        from pillow_heif import register_heif_opener
+    except ImportError:
+        raise InputError(
+            f"{path}: HEIC needs pillow-heif: pip install 'gridreg[photos]', or save it as JPEG"
+        ) from None
+    register_heif_opener()
+
+
+def _check_data(data: bytes, kind: str | None) -> None:
+    """Refuse what decoders would accept: PNG data with a wrong checksum, and JPEGs of endless scans."""
+    if kind in ("JPEG", "MPO") and data.count(b"\xff\xda") > _MOST_SCANS:
+        raise ValueError(f"more than {_MOST_SCANS} scans")
+    position, name = 8, b""
+    while kind == "PNG" and name != b"IEND":
+        length, name = struct.unpack(">I4s", data[position : position + 8])
+        end = position + 8 + length
+        stored = data[end : end + 4]
+        if len(stored) < 4 or (
+            name == b"IDAT" and zlib.crc32(data[position + 4 : end]) != int.from_bytes(stored, "big")
+        ):
+            raise ValueError(f"damaged chunk {name!r}")
+        position = end + 4
+
+
+def _not_whole(path: Path, error: Exception) -> InputError:
+    return InputError(f"{path}: not a whole image ({str(error) or type(error).__name__})")
+
+
+def _turn(
+    image: Image.Image, path: Path, stated: tuple[float, float] | None, as_stored: bool
+) -> Image.Transpose | None:
+    """Return how to turn an opened image so that it is what its camera saw."""
+    orientation = _orientation(image, path)
+    if orientation == 1:
+        return None
+    turn = _TURNS[orientation]
+    if turn in SIDEWAYS and image.width != image.height and stated is not None:
+        as_stored = all(abs(a - b) < 1 for a, b in zip(image.size, stated, strict=True))
+    return None if as_stored else turn
+
+
+def _orientation(image: Image.Image, path: Path) -> int:
+    """Return the EXIF orientation of an opened image: 1 is upright, 5 to 8 swap width and height."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             # Read anew, because opening a JPEG has tried already and keeps silent about damage.
             Image.Exif().load(image.info.get("exif", b""))
-            orientation = image.getexif().get(_ORIENTATION, 1)
-    except (*_DECODER_ERRORS, Warning) as error:
-        raise InputError(
-            f"{path}: EXIF data cannot be read ({_one_line(error, path)}), save it anew"
-        ) from None
+            orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
+    except Exception as error:
+        reason = str(error) or type(error).__name__
+        raise InputError(f"{path}: EXIF data cannot be read ({reason}), save it anew") from None
     if orientation not in range(1, 9):
         raise InputError(f"{path}: EXIF orientation is {orientation!r}, expected 1 to 8")
     return int(orientation)
 
 
-def _read_bytes(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except FileNotFoundError:
-        raise InputError(f"{path}: image not found") from None
-    except OSError as error:
-        raise InputError(f"{path}: image cannot be read ({error.strerror})") from None
+def _low_bytes(image: Image.Image, data: bytes) -> Image.Image | None:
+    """Return the low bytes of a PNG of 16 bits a channel, of which Pillow decodes the high ones alone; else
+    None."""
+    if not isinstance(image, ImageFile.ImageFile) or image.format != "PNG" or not image.tile:
+        return None
+    tile = image.tile[0]
+    if tile.args not in ("RGB;16B", "RGBA;16B"):
+        return None
+    low = Image.open(io.BytesIO(data), formats=("PNG",))
+    assert isinstance(low, ImageFile.ImageFile)
+    # Read as if the low byte came first, the "high" byte that Pillow keeps is the low one.
+    low.tile = [tile._replace(args=f"{tile.args[:-1]}L")]
+    low.load()
+    return low
 
 
-def _not_whole(path: Path, error: Exception) -> InputError:
-    if isinstance(error, InputError):
-        return error
-    return InputError(f"{path}: not a whole image ({_one_line(error, path)})")
+def _values(image: Image.Image, low: Image.Image | None, path: Path) -> NDArray[np.float32]:
+    """Return the ``(H, W, 3)`` or ``(H, W, 4)`` pixels of a loaded image in [0, 1]."""
+    if image.mode == "F":
+        values: NDArray[np.float32] = np.asarray(image)[..., None]
+        if not (values >= 0).all() or not (values <= 1).all():
+            raise InputError(f"{path}: image holds floats outside of 0 to 1, expected 8 or 16 bits a channel")
+        return np.repeat(values, 3, axis=-1)
+    if low is None and not image.mode.startswith("I"):
+        mode = "RGBA" if image.has_transparency_data else "RGB"
+        return _unit(np.asarray(image.convert(mode)), 255)
+    words = (
+        np.asarray(image)[..., None]
+        if low is None
+        else np.asarray(image).astype(np.uint16) << 8 | np.asarray(low)
+    )
+    if image.mode == "I" and image.format != "PNG":
+        raise InputError(f"{path}: image holds 32-bit integers, expected 8 or 16 bits a channel")
+    key = image.info.get("transparency")
+    alpha = [] if key is None else [(words != np.array(key)).any(axis=-1, keepdims=True) * np.uint16(65535)]
+    words = np.concatenate([np.repeat(words, 3, axis=-1) if low is None else words, *alpha], axis=-1)
+    return _unit(words, 65535)
 
 
-def _one_line(error: Exception, path: Path) -> str:
-    return " ".join(str(error).replace(str(path), "").split()) or type(error).__name__
-
-
-def _open(data: bytes) -> Image.Image:
-    """Open an image without Pillow's own words on broken EXIF data: `upright` refuses them in one line."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return Image.open(io.BytesIO(data))
-
-
-def _decode(data: bytes, path: Path, stated: tuple[int, int] | None, as_stored: bool) -> NDArray[np.float32]:
-    """Decode to ``(H, W, 3)`` or ``(H, W, 4)``, whichever the file holds."""
-    with _open(data) as opened:
-        image, _ = _turned(opened, path, stated, as_stored)
-        if image.mode.startswith("I;16"):
-            grey: NDArray[np.float32] = np.divide(np.asarray(image), 65535, dtype=np.float32)
-            return np.repeat(grey[..., None], 3, axis=-1)
-        mode = "RGBA" if opened.has_transparency_data else "RGB"
-        pixels: NDArray[np.float32] = np.divide(np.asarray(image.convert(mode)), 255, dtype=np.float32)
-        return pixels
-
-
-def _turned(
-    opened: Image.Image, path: Path, stated: tuple[int, int] | None, as_stored: bool
-) -> tuple[Image.Image, bool]:
-    """Return an opened image as its camera saw it, and whether its EXIF data say that it is stored turned."""
-    # Pillow reads a PNG to its end to find EXIF data: a cut image has to fail before.
-    opened.load()
-    orientation = upright(opened, path)
-    if orientation == 1:
-        return opened, False
-    sideways = orientation >= 5 and opened.width != opened.height
-    keep = opened.size == stated if sideways and stated is not None else as_stored
-    return (opened if keep else opened.transpose(_TURNS[orientation])), True
+def _unit(values: NDArray[Any], top: int) -> NDArray[np.float32]:
+    scaled: NDArray[np.float32] = np.divide(values, top, dtype=np.float32)
+    return scaled
 
 
 def copy_upright(
-    path: Path, target: Path, *, stated: tuple[int, int] | None = None, as_stored: bool = False
-) -> tuple[int, int]:
-    """Copy an image to where nothing but its pixels says which way is up, and return its width and height.
+    path: Path,
+    target: Path,
+    *,
+    stated: tuple[float, float] | None = None,
+    as_stored: bool = False,
+) -> tuple[Path, tuple[int, int], Image.Transpose | None]:
+    """Copy an image to where nothing but its pixels says which way is up.
 
-    Bytes are copied where they can be; a JPEG that is stored turned is encoded anew at quality 95, and keeps of its
-    EXIF data what tells the focal length.
+    Bytes are copied where they can be. A PNG or JPEG that is stored turned is encoded anew (at quality 95),
+    and so is what is neither PNG nor JPEG, as ``.jpg``, or ``.png`` if it has alpha; what tells the focal
+    length is kept of EXIF data.
 
     Args:
         path: the image.
-        target: where to write it, with the same extension.
-        stated: see :func:`read_rgba`.
-        as_stored: see :func:`read_rgba`.
+        target: where to write it; its extension may be replaced.
+        stated: see :func:`decode`.
+        as_stored: see :func:`decode`.
+
+    Returns:
+        The file written, its width and height, and how it was turned.
 
     Raises:
         InputError: when the image cannot be read.
     """
-    data = _read_bytes(path)
-    try:
-        with _open(data) as opened:
-            image, anew = _turned(opened, path, stated, as_stored)
-            size = image.size
-            exif = _lens_notes(opened) if anew else Image.Exif()
-            if anew:
-                image.info.clear()
-    except _DECODER_ERRORS as error:
-        raise _not_whole(path, error) from None
-    if anew:
-        image.save(target, quality=95, exif=exif)
-    else:
-        target.write_bytes(data)
-    return size
+    with open_image(path) as image:
+        image.load()
+        turn = _turn(image, path, stated, as_stored)
+        oriented = _orientation(image, path) != 1
+        if image.format in ("PNG", "JPEG") and not oriented:
+            target.write_bytes(read_bytes(path, "image"))
+            return target, image.size, None
+        exif = _lens_notes(image)
+        upright = image if turn is None else image.transpose(turn)
+        upright.info.clear()
+        if image.format not in ("PNG", "JPEG", "MPO"):
+            kind = "RGBA" if image.has_transparency_data else "RGB"
+            upright = upright.convert(kind)
+            target = target.with_name(target.name + (".png" if kind == "RGBA" else ".jpg"))
+        upright.save(target, quality=95, exif=exif)
+        return target, upright.size, turn
 
 
 def _lens_notes(image: Image.Image) -> Image.Exif:
@@ -218,11 +317,11 @@ def area_mean(image: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
     Raises:
         InputError: when ``factor`` does not divide the size.
     """
-    height, width, channels = image.shape
+    height, width, _ = image.shape
     if factor < 1 or height % factor or width % factor:
         raise InputError(f"downscale: {factor} does not divide the image size {width}x{height}")
     if factor == 1:
         return image
-    blocks = image.reshape(height // factor, factor, width // factor, factor, channels)
+    blocks = image.reshape(height // factor, factor, width // factor, factor, -1)
     reduced: NDArray[np.float32] = blocks.mean(axis=(1, 3), dtype=np.float32)
     return reduced

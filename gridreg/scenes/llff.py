@@ -6,6 +6,7 @@ coordinates.
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import numpy as np
@@ -15,55 +16,91 @@ from torch import Tensor
 
 from gridreg.errors import InputError
 from gridreg.scenes.extent import Extent
-from gridreg.scenes.frames import Frame, SceneFiles, StatedIntrinsics, check_pose
+from gridreg.scenes.files import list_images, read_bytes
+from gridreg.scenes.frames import Frame, SceneFiles, StatedIntrinsics
+from gridreg.scenes.gate import check_pose
+from gridreg.scenes.images import image_size
 
 __all__ = ["ndc_rays", "read_llff"]
 
-_IMAGES = (".jpg", ".jpeg", ".png")
 # x and y reach a little past the image's edge at the near plane; z = -1 is the near plane, z = 1 infinity.
 _NDC_BOX = ((-1.5, -1.67, -1.0), (1.5, 1.67, 1.0))
+# Cosine of the widest angle between a forward-facing camera and the average one: 60 degrees.
+_FORWARD = 0.5
 
 
 def read_llff(folder: Path) -> SceneFiles:
-    """Read ``poses_bounds.npy`` and the list of images in ``images/`` without opening one.
+    """Read ``poses_bounds.npy`` and the list of images in ``images/`` (or a reduced ``images_8/``) without
+    decoding one.
 
-    As in NeRF, the world is scaled so that the nearest depth becomes 4/3, and centred on the average
-    camera, which then looks along -z; the near plane of the normalised coordinates lies at depth 1.
+    As in NeRF, the world of forward-facing cameras is scaled so that the nearest depth becomes 4/3, and
+    centred on the average camera, which then looks along -z; the near plane of the normalised coordinates
+    lies at depth 1. Cameras around an object (LLFF's tools write them as well) keep their world, as
+    normalised coordinates hold before one plane only.
 
     Raises:
         InputError: for a missing or malformed file, or a number of images that is not that of the poses.
     """
     path = folder / "poses_bounds.npy"
     rows = _read_rows(path)
-    images = sorted(p.name for p in (folder / "images").glob("*") if p.suffix.lower() in _IMAGES)
-    if len(images) != len(rows):
-        raise InputError(
-            f"{path}: holds {len(rows)} poses, but {folder / 'images'} holds {len(images)} images"
-        )
+    images = _images_folder(folder)
+    names = list_images(images)
+    if len(names) != len(rows):
+        raise InputError(f"{path}: holds {len(rows)} poses, but {images} holds {len(names)} images")
     matrices = rows[:, :15].reshape(-1, 3, 5)
     # LLFF's columns are down, right, back; ours are right, up, back.
     poses = np.stack([matrices[..., 1], -matrices[..., 0], matrices[..., 2], matrices[..., 3]], axis=-1)
     poses = np.stack([check_pose(pose, f"{path}: pose {i}") for i, pose in enumerate(poses)])
-    scale = 1 / (0.75 * float(rows[:, 15].min()))
-    poses[:, :3, 3] *= scale
-    poses = np.linalg.inv(_average_pose(poses)) @ poses
+    factor = _factor(images, names[0], matrices[0, :2, 4])
+    forward = _look_forward(poses)
+    extent: Extent | None = None
+    notes: tuple[str, ...] = ()
+    if forward:
+        poses[:, :3, 3] *= 1 / (0.75 * float(rows[:, 15].min()))
+        poses = np.linalg.inv(_average_pose(poses)) @ poses
+        bounds = np.array(_NDC_BOX)
+        extent = Extent(0.0, float(np.linalg.norm(bounds[1] - bounds[0])), bounds)
+    else:
+        notes = (
+            f"{path}: cameras look in different directions, so nothing is forward-facing and the box is a cube",
+        )
     frames = []
-    for i, (image, pose) in enumerate(zip(images, poses, strict=True)):
-        height, width, focal = matrices[i, :, 4]
+    for i, (name, pose) in enumerate(zip(names, poses, strict=True)):
+        height, width, focal = matrices[i, :, 4] / factor
         camera = StatedIntrinsics(fx=focal, width=round(width), height=round(height))
-        frames.append(Frame(f"images/{image}", pose, camera, f"{path}: pose {i}"))
-    bounds = np.array(_NDC_BOX)
-    far = float(np.linalg.norm(bounds[1] - bounds[0]))
+        frames.append(Frame(f"{images.name}/{name}", pose, camera, f"{path}: pose {i}"))
     return SceneFiles.held_out(
-        folder, frames, path, opaque=True, as_stored=True, ndc=True, extent=Extent(0.0, far, bounds)
+        folder, frames, path, opaque=True, as_stored=True, ndc=forward, extent=extent, notes=notes
     )
 
 
+def _images_folder(folder: Path) -> Path:
+    """Return ``images``, or where there are reduced images alone (``images_4``, ``images_8``) the least
+    reduced."""
+    reduced = sorted(folder.glob("images_*"), key=lambda path: (len(path.name), path.name))
+    return next((path for path in (folder / "images", *reduced) if path.is_dir()), folder / "images")
+
+
+def _factor(images: Path, name: str, stated: NDArray[np.float64]) -> NDArray[np.float64] | float:
+    """Return by what the images of a folder ``images_8`` are reduced: height, width, and for the focal
+    length."""
+    if images.name == "images":
+        return 1.0
+    width, height = image_size(images / name)
+    factor = stated[0] / height, stated[1] / width
+    if abs(factor[0] / factor[1] - 1) > 0.02 or min(factor) < 1:
+        raise InputError(
+            f"{images / name}: image is {width}x{height}, expected {stated[1]:g}x{stated[0]:g} reduced"
+        )
+    return np.array([*factor, factor[1]])
+
+
 def _read_rows(path: Path) -> NDArray[np.float64]:
+    data = read_bytes(path)
     try:
-        rows = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise InputError(f"{path}: not a NumPy file ({' '.join(str(error).split())})") from None
+        rows = np.load(io.BytesIO(data), allow_pickle=False)
+    except Exception as error:
+        raise InputError(f"{path}: not a NumPy file ({str(error) or type(error).__name__})") from None
     if (
         not isinstance(rows, np.ndarray)
         or rows.ndim != 2
@@ -77,6 +114,14 @@ def _read_rows(path: Path) -> NDArray[np.float64]:
     if (rows[:, [4, 9, 14]] <= 0).any() or (rows[:, 15] <= 0).any() or (rows[:, 15] >= rows[:, 16]).any():
         raise InputError(f"{path}: expected positive sizes and focal lengths, and depths 0 < near < far")
     return rows
+
+
+def _look_forward(poses: NDArray[np.float64]) -> bool:
+    """Tell whether all cameras look about the same way, and are held about the same way up."""
+    backs = poses[:, :3, 2]
+    mean = backs.mean(axis=0)
+    together = bool((backs @ mean > _FORWARD * np.linalg.norm(mean)).all())
+    return together and bool(np.linalg.norm(np.cross(poses[:, :3, 1].mean(axis=0), mean)) > 1e-3)
 
 
 def _average_pose(poses: NDArray[np.float64]) -> NDArray[np.float64]:

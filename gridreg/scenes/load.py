@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,13 +14,14 @@ from torch import Tensor
 from gridreg.errors import InputError
 from gridreg.scenes.blender import read_blender
 from gridreg.scenes.colmap import find_models, read_colmap
-from gridreg.scenes.extent import Extent, blender_extent, check_box, points_extent
-from gridreg.scenes.frames import SceneFiles
+from gridreg.scenes.extent import Extent, blender_extent, check_box, points_extent, settled
+from gridreg.scenes.frames import Frame, SceneFiles
+from gridreg.scenes.gate import check_spread
 from gridreg.scenes.llff import read_llff
-from gridreg.scenes.protocols import VALIDATION_VIEWS, Protocol, get_protocol
-from gridreg.scenes.reader import ViewReader
+from gridreg.scenes.protocols import VALIDATION_VIEWS, Protocol, Selection, get_protocol
+from gridreg.scenes.reader import OpenedFrames, ViewReader
 from gridreg.scenes.transforms import read_transforms
-from gridreg.scenes.views import Scene, Views, background_colour
+from gridreg.scenes.views import IN_PLACE, Scene, Views, World, background_colour
 
 __all__ = ["BUILTIN_MARKER", "NotASceneError", "default_protocol", "load_scene", "read_folder"]
 
@@ -52,7 +54,8 @@ def load_scene(
         test: indices into the test frames instead of the protocol's; an empty one reads none.
         validation: indices into the training frames, or how many to take, evenly spread, of those that the
             protocol does not train on.
-        background: instead of the protocol's, and of the one colour that opaque images may have along their edges.
+        background: instead of the protocol's, and of the one colour that opaque images may have along their
+            edges.
         near: world units, instead of what the format or the cameras say.
         far: likewise.
         bounds: ``(2, 3)`` lower and upper corner, likewise.
@@ -64,59 +67,72 @@ def load_scene(
     folder = Path(folder)
     protocol = get_protocol(protocol) if isinstance(protocol, str) else protocol
     files = read_folder(folder)
-    positions = np.stack([frame.pose[:3, 3] for frame in files.train])
-    train_ids = _checked(protocol.train.select(positions), files, "train", f"protocol {protocol.name}")
+    by = f"protocol {protocol.name}"
+    train_ids = _checked(_selected(protocol.train, files.train), files, "train", by)
     scored = files.test
     if test is None and protocol.validates:
-        scored, test_ids = (
-            files.train,
-            _free_ids(VALIDATION_VIEWS, train_ids, files, f"protocol {protocol.name}"),
-        )
+        scored, test_ids = files.train, _free_ids(VALIDATION_VIEWS, train_ids, files, by)
     elif test is None and files.split_here:
         # The held-out frames are the test views; a protocol's rule would thin them out a second time.
         test_ids = tuple(range(len(files.test)))
     elif test is None:
-        test_positions = np.stack([frame.pose[:3, 3] for frame in files.test])
-        test_ids = _checked(protocol.test.select(test_positions), files, "test", f"protocol {protocol.name}")
+        test_ids = _checked(_selected(protocol.test, files.test), files, "test", by)
     else:
         test_ids = _checked(tuple(test), files, "test", "test")
     validation_ids = _validation_ids(validation, train_ids, files)
 
+    chosen = [(files.train, train_ids), (scored, test_ids), (files.train, validation_ids)]
+    frames = [frames[i] for frames, ids in chosen for i in ids]
+    check_spread(np.array([frame.pose[:3, 3] for frame in frames]), [frame.where for frame in frames])
     reader = ViewReader(files, protocol, size, opaque)
-    train, fingerprint = reader.read(files.train, train_ids)
-    test_views, _ = reader.read(scored, test_ids)
-    validation_views = None if validation is None else reader.read(files.train, validation_ids)[0]
-    extent = _extent(files, train)
+    reader.expect(frames)
+    opened = [reader.read(frames, ids) for frames, ids in chosen]
+    given = None if bounds is None else _bounds(bounds)
+    world, extent = _extent(files, opened[0], near, far, given)
+    train, test_views, others = (each.views(world) for each in opened)
     if background is None:
         background = protocol.background if train.backdrop is None else train.backdrop
+    moved = "" if world == IN_PLACE else f"{world}"
     scene = Scene(
         name=folder.resolve().name,
         protocol=protocol.name,
         train=train,
         test=test_views,
-        near=extent.near if near is None else near,
-        far=extent.far if far is None else far,
-        bounds=_bounds(extent.bounds if bounds is None else bounds),
+        near=extent.near,
+        far=extent.far,
+        bounds=torch.as_tensor(extent.bounds, dtype=torch.float32),
         background=background_colour(background),
-        fingerprint=fingerprint,
+        fingerprint=_joined(opened[0].fingerprint, moved),
         builtin=(folder / BUILTIN_MARKER).is_file(),
-        validation=validation_views,
+        validation=None if validation is None else others,
         ndc=files.ndc,
+        world=world,
+        notes=(*files.notes, *reader.notes, *_doubts(world, train, test_views)),
     )
-    check_box(scene, files.points if bounds is not None else None)
+    check_box(scene, files.points if given is not None else None)
     return scene
 
 
 def default_protocol(folder: str | Path) -> str:
     """The protocol that a folder is loaded under when none is named, by its format.
 
-    ``builtin8`` for the built-in scene, ``dietnerf8`` for Blender's two lists of frames, and ``holdout8`` for one list,
-    of which every eighth is held out.
+    ``builtin8`` for the built-in scene, ``dietnerf8`` for Blender's two lists of frames (or all of them,
+    where they are fewer than it selects from), and ``holdout8`` for one list, of which every eighth is held
+    out.
+
+    Raises:
+        InputError: when the lists of a Blender scene cannot be read.
     """
-    if (Path(folder) / BUILTIN_MARKER).is_file():
+    folder = Path(folder)
+    if (folder / BUILTIN_MARKER).is_file():
         return "builtin8"
-    one_list = not (Path(folder) / "transforms_train.json").is_file() and Path(folder).is_dir()
-    return "holdout8" if one_list else "dietnerf8"
+    if not folder.is_dir():
+        return "dietnerf8"
+    files = read_folder(folder) if (folder / "transforms_train.json").is_file() else None
+    if files is None or files.split_here:
+        return "holdout8"
+    wanted = get_protocol("dietnerf8").train.select(np.zeros((len(files.train), 3)))
+    return "dietnerf8" if max(wanted) < len(files.train) else f"first{len(files.train)}"
 
 
 class NotASceneError(InputError):
@@ -145,21 +161,72 @@ def read_folder(folder: Path) -> SceneFiles:
     )
 
 
-def _extent(files: SceneFiles, train: Views) -> Extent:
-    if files.extent is not None:
-        return files.extent
-    poses, size = train.poses.numpy().astype(np.float64), (train.width, train.height)
-    if files.points is not None and not any(frame.mask_path for frame in files.train):
-        return points_extent(poses, files.points)
-    return blender_extent(poses, train.intrinsics.numpy().astype(np.float64), size)
+def _selected(selection: Selection, frames: list[Frame]) -> tuple[int, ...]:
+    return selection.select(np.array([frame.pose[:3, 3] for frame in frames]).reshape(-1, 3))
+
+
+def _extent(
+    files: SceneFiles,
+    train: OpenedFrames,
+    near: float | None,
+    far: float | None,
+    bounds: NDArray[np.float64] | None,
+) -> tuple[World, Extent]:
+    """Return the scene's world, and near, far and box in it: as given, as the files state, or as cameras and
+    points say."""
+    if near is not None and far is not None and bounds is not None:
+        derived = Extent(near, far, bounds)
+    elif files.extent is not None:
+        derived = files.extent
+    elif files.points is not None and not any(frame.mask_path for frame in files.train):
+        derived = points_extent(train.poses, files.points)
+    else:
+        derived = blender_extent(train.poses, train.intrinsics, train.size)
+    extent = Extent(
+        derived.near if near is None else near,
+        derived.far if far is None else far,
+        derived.bounds if bounds is None else bounds,
+    )
+    # Who states a box, in a file or as an argument, counts in the world that it stands in.
+    stays = files.ndc or files.extent is not None or bounds is not None
+    return (IN_PLACE, extent) if stays else settled(extent)
+
+
+def _joined(fingerprint: str, moved: str) -> str:
+    """Return a fingerprint that tells apart scenes whose worlds were moved differently."""
+    return hashlib.sha256((fingerprint + moved).encode()).hexdigest() if moved else fingerprint
+
+
+def _doubts(world: World, train: Views, test: Views) -> list[str]:
+    """Return what makes a score, or a place in the world, mean less than it seems."""
+    notes = []
+    if world != IN_PLACE:
+        place = ", ".join(f"{value:.6g}" for value in world.origin)
+        notes.append(
+            f"the world is centred on ({place}) and scaled: its unit is now {world.unit:.4g} of the files'"
+        )
+    for what, views in (("training", train), ("test", test)):
+        seen = views.rgba[..., :3] * views.rgba[..., 3:]
+        pixels = torch.cat([seen, views.rgba[..., 3:]], dim=-1).flatten(1, 2)
+        alike = (
+            (pixels.amax(dim=1) - pixels.amin(dim=1)).amax(dim=-1) < 1 / 255 if len(views) else torch.empty(0)
+        )
+        names = [name for name, same in zip(views.names, alike.tolist(), strict=True) if same]
+        if names:
+            notes.append(
+                f"{len(names)} of {len(views)} {what} images show nothing but one colour ({names[0]}, ...): "
+                "a high score on them means nothing"
+            )
+    return notes
 
 
 def _checked(ids: tuple[int, ...], files: SceneFiles, split: str, by: str) -> tuple[int, ...]:
     count = len(files.train if split == "train" else files.test)
     for i in ids:
         if isinstance(i, bool) or not isinstance(i, int) or not 0 <= i < count:
+            fits = f"; first{count} would fit, or views{min(8, count)}" if by.startswith("protocol") else ""
             raise InputError(
-                f"{by}: view {i!r} is not in {files.sources[split]}, which lists frames 0 to {count - 1}"
+                f"{by}: view {i!r} is not in {files.sources[split]}, which lists frames 0 to {count - 1}{fits}"
             )
     if len(set(ids)) != len(ids):
         raise InputError(f"{by}: a view is listed twice in {list(ids)}")
@@ -188,8 +255,13 @@ def _free_ids(wanted: int, train_ids: tuple[int, ...], files: SceneFiles, by: st
     return tuple(free[(2 * k + 1) * len(free) // (2 * wanted)] for k in range(wanted))
 
 
-def _bounds(bounds: Sequence[Sequence[float]] | Tensor | NDArray[np.float64]) -> Tensor:
+def _bounds(bounds: Sequence[Sequence[float]] | Tensor) -> NDArray[np.float64]:
     try:
-        return torch.as_tensor(np.asarray(bounds), dtype=torch.float32)
+        box = np.asarray(bounds, dtype=np.float64)
+        if box.shape != (2, 3) or not np.isfinite(box).all() or not (box[0] < box[1]).all():
+            raise ValueError
     except (TypeError, ValueError):
-        raise InputError(f"bounds: found {bounds!r}, expected (2, 3) numbers") from None
+        raise InputError(
+            f"bounds: found {bounds!r}, expected (2, 3) numbers with lower corner below upper"
+        ) from None
+    return box

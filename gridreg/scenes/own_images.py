@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,14 +18,16 @@ from gridreg.errors import InputError
 from gridreg.scenes import structure_from_motion
 from gridreg.scenes.colmap import frames_of_model, mask_of
 from gridreg.scenes.colmap_model import read_model
-from gridreg.scenes.frames import Frame, SceneFiles, resolve_inside
-from gridreg.scenes.images import copy_upright, read_rgba
+from gridreg.scenes.files import EXTENSIONS, list_images, resolve_inside
+from gridreg.scenes.frames import Frame, SceneFiles
+from gridreg.scenes.images import copy_upright, decode, open_image, read_rgba
+from gridreg.scenes.masks import fit_mask
 
-__all__ = ["attach_masks", "copy_frames", "copy_images", "find_cameras", "shrink_images"]
+__all__ = ["Copied", "attach_masks", "copy_frames", "copy_images", "find_cameras", "shrink_images"]
 
 Progress = Callable[[str], None]
 
-_IMAGES = (".png", ".jpg", ".jpeg")
+_HEIC = (".heic", ".heif")
 _FEWEST = 4
 _ADVICE = (
     "take more images, each sharing two thirds of its view with its neighbours, sharp, without zooming, "
@@ -32,29 +35,50 @@ _ADVICE = (
 )
 
 
-def copy_images(source: Path, scene: Path) -> list[str]:
-    """Copy the images of a folder upright into ``scene/images`` and return their names.
+class Copied(NamedTuple):
+    """An image copied into a scene folder.
+
+    Attributes:
+        path: below ``images``.
+        size: width and height in pixels.
+        turn: how it was turned from what was stored.
+    """
+
+    path: Path
+    size: tuple[int, int]
+    turn: Image.Transpose | None
+
+
+def copy_images(source: Path, scene: Path, progress: Progress) -> list[Copied]:
+    """Copy the images of a folder upright into ``scene/images``; what is left aside is said.
 
     Raises:
         InputError: for a folder without images, a damaged one, or images of different sizes.
     """
-    images = sorted(path for path in source.iterdir() if path.suffix.lower() in _IMAGES and path.is_file())
-    if not images:
-        others = sorted({path.suffix for path in source.iterdir() if path.is_file() and path.suffix})
+    names = list_images(source)
+    stems = [Path(name).stem for name in names if Path(name).suffix.lower() not in _HEIC]
+    # A telephone that stores both writes one photograph twice.
+    twice = [name for name in names if Path(name).suffix.lower() in _HEIC and Path(name).stem in stems]
+    names = [name for name in names if name not in twice]
+    suffixes = {path.suffix for path in source.iterdir() if path.is_file() and path.name[0] != "."}
+    others = sorted(suffix for suffix in suffixes if suffix and suffix.lower() not in EXTENSIONS)
+    if not names:
         found = f"only {', '.join(others)} files" if others else "nothing"
-        raise InputError(f"{source}: found {found}, expected images (.jpg or .png)")
-    if len(images) < _FEWEST:
-        raise InputError(f"{source}: found {len(images)} images, expected at least {_FEWEST}; {_ADVICE}")
-    first: tuple[int, int] | None = None
-    for path in images:
-        size = copy_upright(path, scene / "images" / path.name)
-        first = first or size
+        raise InputError(f"{source}: found {found}, expected images (.jpg, .png, .webp, .tif or .heic)")
+    if len(names) < _FEWEST:
+        raise InputError(f"{source}: found {len(names)} images, expected at least {_FEWEST}; {_ADVICE}")
+    if twice or others:
+        progress(f"left aside {', '.join([*twice, *(f'{suffix} files' for suffix in others)])}")
+    copied: list[Copied] = []
+    for name in names:
+        copied.append(Copied(*copy_upright(source / name, scene / "images" / name)))
+        size, first = copied[-1].size, copied[0].size
         if size != first:
             raise InputError(
-                f"{path}: image is {size[0]}x{size[1]} upright, expected {first[0]}x{first[1]} as "
-                f"{images[0].name}: all images share one camera"
+                f"{source / name}: image is {size[0]}x{size[1]} upright, expected {first[0]}x{first[1]} as "
+                f"{names[0]}: all images share one camera"
             )
-    return [path.name for path in images]
+    return copied
 
 
 def find_cameras(
@@ -107,12 +131,13 @@ def _write_opaque(path: Path, target: Path) -> None:
     Image.fromarray(np.rint(255 * flat).astype(np.uint8)).save(target)
 
 
-def copy_frames(files: SceneFiles, scene: Path) -> list[Frame]:
+def copy_frames(files: SceneFiles, scene: Path) -> tuple[list[Frame], list[Copied]]:
     """Copy the images and masks of a scene with cameras into another folder and return frames that name
     them there.
 
     Raises:
-        InputError: for an image or mask that is missing or damaged, outside of its scene, or of another size than its
+        InputError: for an image or mask that is missing or damaged, outside of its scene, or of another size
+            than its
             camera or the other images.
     """
     frames = sorted([*files.train, *files.test], key=lambda frame: frame.file_path)
@@ -120,44 +145,49 @@ def copy_frames(files: SceneFiles, scene: Path) -> list[Frame]:
     names = [path.name for path in paths]
     if len(set(names)) != len(names):
         names = ["_".join(path.relative_to(files.folder.resolve()).parts) for path in paths]
-    copied = []
-    first: tuple[int, int] | None = None
+    made: list[Frame] = []
+    copied: list[Copied] = []
     for frame, path, name in zip(frames, paths, names, strict=True):
-        size = copy_upright(
-            path, scene / "images" / name, stated=frame.camera.size, as_stored=files.as_stored
+        target = scene / "images" / name
+        copied.append(
+            Copied(*copy_upright(path, target, stated=frame.camera.size, as_stored=files.as_stored))
         )
-        first = first or size
-        expected = (frame.camera.width or first[0], frame.camera.height or first[1])
-        for wanted in (expected, first):
-            if size != wanted:
-                raise InputError(f"{path}: image is {size[0]}x{size[1]}, expected {wanted[0]}x{wanted[1]}")
+        size, first = copied[-1].size, copied[0].size
+        stated = frame.camera.width or first[0], frame.camera.height or first[1]
+        for wanted in (stated, first):
+            if abs(size[0] - wanted[0]) >= 1 or abs(size[1] - wanted[1]) >= 1:
+                raise InputError(
+                    f"{path}: image is {size[0]}x{size[1]}, expected {wanted[0]:g}x{wanted[1]:g}"
+                )
         mask_path = None
         if frame.mask_path is not None:
             mask = resolve_inside(files.folder, frame.mask_path, frame.where)
-            mask_path = _copy_mask(mask, scene, name)
-        copied.append(replace(frame, file_path=f"images/{name}", mask_path=mask_path))
-    return copied
+            mask_path = _copy_mask(mask, scene, copied[-1], as_stored=files.as_stored)
+        made.append(replace(frame, file_path=f"images/{copied[-1].path.name}", mask_path=mask_path))
+    return made, copied
 
 
-def attach_masks(frames: list[Frame], masks: Path, scene: Path) -> list[Frame]:
+def attach_masks(frames: list[Frame], masks: Path, scene: Path, copied: list[Copied]) -> list[Frame]:
     """Copy a mask for every frame from a folder of masks and return frames that name them.
 
     Raises:
-        InputError: for a mask that is missing or damaged.
+        InputError: for a mask that is missing or damaged, or does not fit its image.
     """
+    images = {image.path.name: image for image in copied}
     named = []
     for frame in frames:
-        name = Path(frame.file_path).name
-        mask = mask_of(masks, name)
-        named.append(replace(frame, mask_path=_copy_mask(masks / mask, scene, name)))
+        image = images[Path(frame.file_path).name]
+        mask = masks / mask_of(masks, image.path.name)
+        named.append(replace(frame, mask_path=_copy_mask(mask, scene, image, as_stored=False)))
     return named
 
 
-def _copy_mask(mask: Path, scene: Path, name: str) -> str:
-    """Copy the mask of the image ``name`` into ``scene/masks`` and return its path there."""
+def _copy_mask(mask: Path, scene: Path, image: Copied, *, as_stored: bool) -> str:
+    """Write what the mask of an image means, black and white, into ``scene/masks`` and return its path there."""
     (scene / "masks").mkdir(exist_ok=True)
-    place = f"masks/{name}{mask.suffix}"
-    copy_upright(mask, scene / place)
+    place = f"masks/{image.path.name}.png"
+    kept = fit_mask(mask, image.size, image.turn, as_stored=as_stored)
+    Image.fromarray(np.rint(255 * kept).astype(np.uint8)).save(scene / place)
     return place
 
 
@@ -171,14 +201,10 @@ def shrink_images(frames: list[Frame], scene: Path, size: tuple[int, int], longe
     if fraction >= 1:
         return size
     new = max(1, round(size[0] * fraction)), max(1, round(size[1] * fraction))
-    for frame in frames:
-        for name in (frame.file_path, frame.mask_path):
-            if name is None:
-                continue
-            path = scene / name
-            with Image.open(path) as opened:
-                image = opened
-                if opened.mode in ("1", "P"):
-                    image = opened.convert("RGBA" if opened.has_transparency_data else "RGB")
-                image.resize(new, Image.Resampling.BOX).save(path, quality=95)
+    for path in [scene / name for frame in frames for name in (frame.file_path, frame.mask_path) if name]:
+        with open_image(path) as opened:
+            image = opened
+            if opened.mode not in ("L", "LA", "RGB", "RGBA"):
+                image = Image.fromarray(np.rint(255 * decode(path).pixels).astype(np.uint8))
+            image.resize(new, Image.Resampling.BOX).save(path, quality=95)
     return new

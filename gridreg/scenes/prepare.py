@@ -8,18 +8,19 @@ import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from gridreg.errors import InputError
 from gridreg.scenes.drawing import draw_cameras
-from gridreg.scenes.extent import Extent, box_is_seen, camera_extent, points_extent
+from gridreg.scenes.extent import Extent, box_is_seen, camera_extent, centred, points_extent
 from gridreg.scenes.frames import Frame, StatedIntrinsics
+from gridreg.scenes.gate import check_cameras, check_extent, check_spread
 from gridreg.scenes.load import NotASceneError, read_folder
 from gridreg.scenes.own_images import (
+    Copied,
     attach_masks,
     copy_frames,
     copy_images,
@@ -27,12 +28,11 @@ from gridreg.scenes.own_images import (
     shrink_images,
 )
 from gridreg.scenes.transforms import EXTENT_KEY
+from gridreg.scenes.views import IN_PLACE, World
 
 __all__ = ["Prepared", "prepare"]
 
 Array = NDArray[np.float64]
-
-_HALF_EDGE = 1.3
 
 
 @dataclass(frozen=True)
@@ -81,15 +81,18 @@ def prepare(
     and can be overridden when the scene is loaded.
 
     Args:
-        source: a folder of images (JPEG or PNG, one size; pycolmap finds the cameras), or a scene whose
+        source: a folder of images (of one size; pycolmap finds the cameras), or a scene whose
             cameras COLMAP, nerfstudio or instant-ngp found.
         out: the scene folder to make; must not exist.
         masks: folder with a mask for every image (white is kept), which becomes its alpha: called like the
             image, with the extension ``.png`` instead of its own or after it.
-        near: distance from a camera where looking begins, world units of the made scene, instead of the derived one.
+        near: distance from a camera where looking begins, world units of the made scene, instead of the
+            derived one.
         far: distance from a camera where looking ends, likewise.
-        bounds: ``(2, 3)`` lower and upper corner, likewise; the world stays turned, centred and scaled as derived.
-        longest_edge: pixels; larger images are reduced (by area) once their cameras are known, as the photographs
+        bounds: ``(2, 3)`` lower and upper corner, likewise; the world stays turned, centred and scaled as
+            derived.
+        longest_edge: pixels; larger images are reduced (by area) once their cameras are known, as the
+            photographs
             of a telephone would fill the memory and show no more than the grid can hold.
         progress: called with the name of each stage.
 
@@ -111,13 +114,11 @@ def prepare(
         scratch = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
         scene = scratch / "scene"
         (scene / "images").mkdir(parents=True)
-        frames, points, names = _gather(source, scene, scratch, progress)
+        made = _gather(source, scene, scratch, progress)
         if masks is not None:
-            frames = attach_masks(frames, Path(masks), scene)
+            made = made._replace(frames=attach_masks(made.frames, Path(masks), scene, made.copied))
         progress("box")
-        frames, extent = _write(
-            frames, points, scene, longest_edge, lambda derived: _overridden(derived, near, far, bounds)
-        )
+        frames, extent = _write(made, scene, longest_edge, near, far, bounds)
         scene.rename(out)
     except OSError as error:
         raise InputError(f"{out}: cannot be written ({error.strerror or error})") from None
@@ -125,68 +126,99 @@ def prepare(
         if scratch is not None:
             shutil.rmtree(scratch, ignore_errors=True)
     registered = tuple(Path(frame.file_path).name for frame in frames)
-    missing = tuple(name for name in names if name not in registered)
+    missing = tuple(image.path.name for image in made.copied if image.path.name not in registered)
     return Prepared(out, registered, missing, extent, out / "cameras.png")
 
 
-def _gather(
-    source: Path, scene: Path, scratch: Path, progress: Callable[[str], None]
-) -> tuple[list[Frame], Array | None, list[str]]:
-    """Fill ``scene/images``; return frames, points and the names of all images."""
+class _Gathered(NamedTuple):
+    """Frames whose images are in place, points on surfaces, all images, and the paths that the source holds
+    out itself."""
+
+    frames: list[Frame]
+    points: Array | None
+    copied: list[Copied]
+    test: set[str]
+
+
+def _gather(source: Path, scene: Path, scratch: Path, progress: Callable[[str], None]) -> _Gathered:
+    """Fill ``scene/images`` and find the cameras."""
     try:
         files = read_folder(source)
     except NotASceneError:
-        names = copy_images(source, scene)
-        frames, points = find_cameras(scene, names, scratch, progress)
-        return frames, points, names
+        copied = copy_images(source, scene, progress)
+        frames, points = find_cameras(scene, [image.path.name for image in copied], scratch, progress)
+        return _Gathered(frames, points, copied, set())
     if files.ndc or not files.split_here:
         raise InputError(f"{source}: needs no preparation, load it as it is")
-    frames = copy_frames(files, scene)
-    return frames, files.points, [Path(frame.file_path).name for frame in frames]
+    for note in files.notes:
+        progress(note)
+    check_spread(
+        np.array([frame.pose[:3, 3] for frame in (*files.train, *files.test)]),
+        [frame.where for frame in (*files.train, *files.test)],
+    )
+    frames, copied = copy_frames(files, scene)
+    held = {frame.where for frame in files.test} if files.own_split else set()
+    return _Gathered(
+        frames, files.points, copied, {frame.file_path for frame in frames if frame.where in held}
+    )
 
 
-def _overridden(
-    extent: Extent, near: float | None, far: float | None, bounds: Sequence[Sequence[float]] | None
-) -> Extent:
-    box = extent.bounds if bounds is None else np.array(bounds, dtype=np.float64)
-    wanted = Extent(extent.near if near is None else near, extent.far if far is None else far, box)
-    if not 0 <= wanted.near < wanted.far < np.inf:
-        raise InputError(f"near, far: found {wanted.near:g} and {wanted.far:g}, expected 0 <= near < far")
-    if box.shape != (2, 3) or not np.isfinite(box).all() or not (box[0] < box[1]).all():
-        raise InputError(f"box: found {box.tolist()}, expected (2, 3) with lower corner below upper")
-    return wanted
+def _placed(
+    poses: Array, intrinsics: Array, size: tuple[int, int], points: Array | None
+) -> tuple[Array, World, Extent]:
+    """Return the rotation that takes up to z, the turned world in which the box reaches 1.3, and the extent
+    in it."""
+    turn = _upwards(poses[:, :3, 1].mean(axis=0))
+    poses = poses.copy()
+    poses[:, :3] = turn @ poses[:, :3]
+    if points is None:
+        extent = camera_extent(poses, intrinsics, size)
+    else:
+        extent = points_extent(poses, points @ turn.T)
+    return turn, *centred(extent)
 
 
 def _write(
-    frames: list[Frame],
-    points: Array | None,
+    made: _Gathered,
     scene: Path,
     longest_edge: int,
-    override: Callable[[Extent], Extent],
+    near: float | None,
+    far: float | None,
+    bounds: Sequence[Sequence[float]] | None,
 ) -> tuple[list[Frame], Extent]:
     """Write ``transforms.json`` and ``cameras.png`` in normalised coordinates."""
-    with Image.open(scene / frames[0].file_path) as image:
-        size = image.size
+    frames, size = made.frames, made.copied[0].size
     intrinsics = np.array([frame.camera.intrinsics(*size) for frame in frames])
     poses = np.stack([frame.pose for frame in frames])
-    turn = _upwards(poses[:, :3, 1].mean(axis=0))
-    poses[:, :3] = turn @ poses[:, :3]
-    points = None if points is None else points @ turn.T
-    masked = any(frame.mask_path for frame in frames)
+    check_cameras(poses, intrinsics, size, [frame.where for frame in frames])
     # Points of a masked scene may lie on what the masks cut away.
-    extent = (
-        camera_extent(poses, intrinsics, size) if points is None or masked else points_extent(poses, points)
+    seen = None if any(frame.mask_path for frame in frames) else made.points
+    try:
+        turn, world, extent = _placed(poses, intrinsics, size, seen)
+    except InputError:
+        # Cameras in the middle of a room, for one: their world stays as it is, if somebody says where to look
+        # in it.
+        if near is None or far is None or bounds is None:
+            raise
+        turn, world, extent = np.eye(3), IN_PLACE, Extent(near, far, np.zeros((2, 3)))
+    poses[:, :3] = turn @ poses[:, :3]
+    poses = world.inward(poses)
+    extent = Extent(
+        extent.near if near is None else near,
+        extent.far if far is None else far,
+        extent.bounds if bounds is None else np.array(bounds, dtype=np.float64),
     )
-    centre = extent.bounds.mean(axis=0)
-    scale = _HALF_EDGE / float((extent.bounds[1] - centre).max())
-    poses[:, :3, 3] = scale * (poses[:, :3, 3] - centre)
-    extent = override(Extent(scale * extent.near, scale * extent.far, scale * (extent.bounds - centre)))
+    check_extent(*extent, poses[:, :3, 3])
     if not box_is_seen(extent, poses, intrinsics, size):
         raise InputError(
             f"box: no camera sees the box {extent.bounds.tolist()} between near {extent.near:g} and far {extent.far:g}"
         )
     frames = [replace(frame, pose=pose) for frame, pose in zip(frames, poses, strict=True)]
-    content = {EXTENT_KEY: {"near": extent.near, "far": extent.far, "bounds": extent.bounds.tolist()}}
+    content: dict[str, Any] = {
+        EXTENT_KEY: {"near": extent.near, "far": extent.far, "bounds": extent.bounds.tolist()}
+    }
+    if made.test:
+        content["test_filenames"] = sorted(made.test)
     reduced = shrink_images(frames, scene, size, longest_edge)
     cameras = [_camera_keys(frame.camera, size, reduced) for frame in frames]
     shared = cameras[0] if all(camera == cameras[0] for camera in cameras) else {}
@@ -201,7 +233,7 @@ def _write(
     ]
     text = json.dumps({**shared, **content, "frames": listed}, indent=2)
     (scene / "transforms.json").write_text(text + "\n", encoding="utf-8")
-    shown = None if points is None else scale * (points - centre)
+    shown = None if made.points is None else (made.points @ turn.T - world.origin) / world.unit
     draw_cameras(scene / "cameras.png", poses, intrinsics, size, extent.bounds, points=shown)
     return frames, extent
 

@@ -145,7 +145,8 @@ class Protocol:
         halve_at: images of this edge, in pixels, are halved by 2x2 area means of RGBA before compositing.
         background: ``"white"`` or ``"black"``.
         source: who uses it.
-        validates: the scored views are `VALIDATION_VIEWS` training frames, evenly spread over those that are not
+        validates: the scored views are `VALIDATION_VIEWS` training frames, evenly spread over those that are
+            not
             trained on, instead of ``test``.
     """
 
@@ -193,8 +194,8 @@ def get_protocol(name: str) -> Protocol:
     Besides :data:`PROTOCOLS`, ``views<N>`` stands for N training views by NumPy's seed-0 choice and
     ``first<N>`` for the first N, both with size, background and test views of ``dietnerf8``; ``spread<N>``
     for N evenly spread over the list and all test views, as stored (RegNeRF's 3, 6 and 9 views of LLFF
-    scenes). Any of them followed by ``-validation``, such as ``dietnerf8-validation``, trains on the same views and
-    scores training frames outside them: for choosing settings without a look at the test views.
+    scenes). Any of them followed by ``-validation``, such as ``dietnerf8-validation``, trains on the same
+    views and scores training frames outside them: for choosing settings without a look at the test views.
 
     Raises:
         InputError: for an unknown name.

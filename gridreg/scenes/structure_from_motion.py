@@ -13,7 +13,8 @@ from typing import Any
 
 # Fraction of the images above which a second attempt is not worth its time.
 _ENOUGH = 0.9
-# Of adjusting and finding points anew: on the images of benchmarks/own_photographs.py a third changes nothing any more.
+# Of adjusting and finding points anew: on the images of benchmarks/own_photographs.py a third changes
+# nothing any more.
 _ROUNDS = 2
 
 STAGES = ("features", "matches", "cameras")
@@ -34,8 +35,8 @@ def reconstruct(images: Path, out: Path) -> int:
     print(STAGES[1], flush=True)
     pycolmap.match_exhaustive(database)
     print(STAGES[2], flush=True)
-    # A lens that is adjusted from the first pair on can collapse to a wide angle when cameras stand in a circle. So it
-    # stays as EXIF data say (or as most lenses are) until all images have their places.
+    # A lens that is adjusted from the first pair on can collapse to a wide angle when cameras stand in a
+    # circle. So it stays as EXIF data say (or as most lenses are) until all images have their places.
     best = _largest_model(database, images, out / "kept_lens", adjust_lens=False)
     if best is not None:
         best = _refined(best, database, images, out)

@@ -5,15 +5,20 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from gridreg.errors import InputError
+from gridreg.scenes.gate import check_cameras, check_extent
 
-__all__ = ["Scene", "Views", "background_colour"]
+__all__ = ["IN_PLACE", "Scene", "Views", "World", "background_colour"]
 
-# Fraction of the edge that is looked at for a backdrop, and of its pixels that must have the colour up to a bound.
+# Fraction of the edge that is looked at for a backdrop, and of its pixels that must have the colour up to a
+# bound.
 _FRAME, _AGREEING, _CLOSE = 0.02, 0.9, 0.05
 
 _COLOURS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
@@ -41,6 +46,38 @@ def background_colour(background: str | Sequence[float] | Tensor) -> Tensor:
     if colour.shape != (3,) or not bool(((colour >= 0) & (colour <= 1)).all()):
         raise InputError(f"background: found {background!r}, expected three numbers in [0, 1]")
     return colour
+
+
+class World(NamedTuple):
+    """World of a scene's files: ``files = origin + unit * scene``, so that neither unit nor origin of length
+    matters.
+
+    Attributes:
+        origin: ``(3,)`` the scene's origin in the world of the files.
+        unit: length of the scene's unit there.
+
+    Example:
+        >>> World((10.0, 0.0, 0.0), 100.0).outward(np.array([[1.0, 2.0, 0.0]])).tolist()
+        [[110.0, 200.0, 0.0]]
+    """
+
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    unit: float = 1.0
+
+    def outward(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return ``(..., 3)`` points of the scene in the world of the files."""
+        return np.asarray(self.unit * points + self.origin)
+
+    def inward(self, poses: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return ``(V, 4, 4)`` poses of the files' world in the scene; an identity leaves every bit."""
+        moved: NDArray[np.float64] = poses.copy()
+        if self != World():
+            moved[:, :3, 3] = (poses[:, :3, 3] - self.origin) / self.unit
+        return moved
+
+
+IN_PLACE = World()
+"""The world of a scene that stays where its files have it."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +110,8 @@ class Views:
             raise InputError(
                 f"names, ids: found {len(self.names)} and {len(self.ids)}, expected {count} each"
             )
+        called = [f"view {name!r}" for name in self.names]
+        check_cameras(self.poses.cpu(), self.intrinsics.cpu(), (self.width, self.height), called)
 
     def __len__(self) -> int:
         return int(self.rgba.shape[0])
@@ -142,12 +181,16 @@ class Scene:
         near: distance along a ray, world units, before which nothing is looked for.
         far: distance along a ray, world units, beyond which nothing is looked for.
         bounds: ``(2, 3)`` float32, lower and upper corner of the box that holds the scene, world units.
-        background: ``(3,)`` float32, the colour behind renders and targets; that of opaque images' `Views.backdrop`.
+        background: ``(3,)`` float32, the colour behind renders and targets; that of opaque images'
+            `Views.backdrop`.
         fingerprint: hash of what training sees: the training images' pixels, ids, size and cameras. It does
             not depend on which test or validation views were read, so a checkpoint can be scored on others.
         builtin: whether this is the built-in scene, which no published figure is about.
         validation: views outside both, for tuning, when they were asked for.
         ndc: whether rays are to be mapped to normalised device coordinates (forward-facing scenes).
+        world: where the scene lies in the world of its files; poses, box and distances here are those of the
+            scene.
+        notes: what a user should know about how the files were understood, a line each.
     """
 
     name: str
@@ -162,11 +205,9 @@ class Scene:
     builtin: bool = False
     validation: Views | None = None
     ndc: bool = False
+    world: World = IN_PLACE
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        if not 0 <= self.near < self.far:
-            raise InputError(f"near, far: found {self.near} and {self.far}, expected 0 <= near < far")
-        if tuple(self.bounds.shape) != (2, 3) or not bool((self.bounds[0] < self.bounds[1]).all()):
-            raise InputError(
-                f"bounds: found {self.bounds.tolist()}, expected (2, 3) with lower corner below upper"
-            )
+        positions = torch.cat([views.poses[:, :3, 3] for views in (self.train, self.test)])
+        check_extent(self.near, self.far, self.bounds.cpu(), positions.cpu())

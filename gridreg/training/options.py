@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -31,6 +32,10 @@ class TrainOptions:
     """Scene folder (Blender, transforms.json, COLMAP, LLFF); without one, the built-in scene."""
     protocol: _Name = None
     """Views by name: dietnerf8 (default for Blender), holdout8 (default for one list), gs8, human8, views<N>, ..."""
+    size: _Number = None
+    """Width of the images in pixels; must divide what is stored; default: the protocol's."""
+    opaque: bool = False
+    """Take images without alpha as opaque, also beside others that have it."""
     preset: str = "quick"
     """Field, schedule and regularizers by name; `paper` is few_tensorf."""
     composition: _Name = None
@@ -74,12 +79,14 @@ def configure(options: TrainOptions) -> RunConfig:
     if options.config is not None:
         config = from_yaml(options.config, RunConfig, base=config)
     changes: dict[str, Any] = {}
-    for name in ("protocol", "backbone", "seed", "composition"):
+    for name in ("protocol", "backbone", "seed", "composition", "size"):
         value = getattr(options, name)
         if value is not None:
             changes[name] = value
     if options.scene is not None:
         changes["scene"] = str(options.scene)
+    if options.opaque:
+        changes["opaque"] = True
     if options.backbone is not None and options.backbone != config.backbone:
         # The options of one field mean nothing to another, nor do the names of its sites.
         like = _preset_of(options.backbone, preset)
@@ -87,6 +94,9 @@ def configure(options: TrainOptions) -> RunConfig:
         if like is not None:
             changes.setdefault("composition", like.composition)
     config = override(config, {**changes, **assignments(options.set)})
+    if config.scene is not None:
+        # Whoever looks at the run later may stand in another folder.
+        config = replace(config, scene=os.path.abspath(config.scene))
     if options.steps is not None:
         if options.steps < 1:
             raise InputError(f"--steps: found {options.steps}, expected at least 1")

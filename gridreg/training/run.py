@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -32,7 +33,9 @@ __all__ = [
 def open_scene(
     config: RunConfig, cache: Path, validation: int | None = None, *, test: Sequence[int] | None = None
 ) -> Scene:
-    """The scene of a configuration; without one, the built-in scene, made in ``cache`` if it is not there.
+    """Load the scene of a configuration; without one, the built-in scene, made in ``cache`` if it is not there.
+
+    What there is to say about how its files were understood goes to standard error.
 
     Args:
         config: names scene and protocol.
@@ -41,7 +44,13 @@ def open_scene(
         test: indices of the test views instead of the protocol's; an empty one reads none.
     """
     folder = builtin_scene(cache) if config.scene is None else Path(config.scene)
-    return load_scene(folder, config.protocol or default_protocol(folder), test=test, validation=validation)
+    protocol = config.protocol or default_protocol(folder)
+    scene = load_scene(
+        folder, protocol, size=config.size, opaque=config.opaque, test=test, validation=validation
+    )
+    for note in scene.notes:
+        print(f"note: {note}", file=sys.stderr, flush=True)
+    return scene
 
 
 def regularizers_of(config: RunConfig) -> list[Regularizer]:

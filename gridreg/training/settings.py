@@ -152,6 +152,8 @@ class RunConfig:
         train: the schedule.
         composition: regularizers as plain data, see `gridreg.from_config`; or the name of a composition.
         seed: of every random number.
+        size: width of the images in pixels instead of the protocol's; see `gridreg.scenes.load_scene`.
+        opaque: whether images without alpha are taken as opaque beside others that have it.
     """
 
     preset: str = ""
@@ -162,3 +164,5 @@ class RunConfig:
     train: TrainSettings = dataclasses.field(default_factory=TrainSettings)
     composition: str | list[dict[str, Any]] = dataclasses.field(default_factory=list)
     seed: int = 0
+    size: int | None = dataclasses.field(default=None, metadata={"unset": True})
+    opaque: bool = dataclasses.field(default=False, metadata={"unset": True})

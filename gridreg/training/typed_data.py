@@ -79,7 +79,12 @@ def to_data(value: Any) -> Any:
         [1, 'out', {'weight': 8e-05}]
     """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: to_data(getattr(value, f.name)) for f in dataclasses.fields(value) if f.init}
+        return {
+            f.name: to_data(getattr(value, f.name))
+            for f in dataclasses.fields(value)
+            # What came later and is not used leaves no trace: records of before stay equal.
+            if f.init and not (f.metadata.get("unset") and getattr(value, f.name) == f.default)
+        }
     if isinstance(value, Mapping):
         return {str(key): to_data(inner) for key, inner in value.items()}
     if isinstance(value, (list, tuple)):
