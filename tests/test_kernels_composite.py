@@ -25,6 +25,11 @@ def random_packed(seed: int, counts: list[int], channels: int = 3):
     return tau, torch.rand(samples, channels, generator=g), offsets
 
 
+def colours_of(weights, values, offsets):
+    rays = len(offsets) - 1
+    return composite.pixels(weights, values, torch.zeros(len(weights)), torch.zeros(rays, 3), offsets)[0]
+
+
 def gradients(outputs, inputs, seed: int):
     g = torch.Generator().manual_seed(seed)
     return torch.autograd.grad(outputs, inputs, torch.randn(outputs.shape, generator=g).to(outputs.dtype))
@@ -73,23 +78,6 @@ def test_distances_and_backgrounds_may_need_gradients(place):
 
 
 @settings(max_examples=60, deadline=None)
-@given(counts=counts_lists, seed=st.integers(0, 2**31), channels=st.integers(0, 9))
-def test_sums(counts, seed, channels):
-    weights, values, offsets = random_packed(seed, counts, channels)
-    weights.requires_grad_()
-    values.requires_grad_()
-    found, expected = (
-        composite.accumulate(weights, values, offsets),
-        ops.accumulate.reference(weights, values, offsets),
-    )
-    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
-    for a, b in zip(
-        gradients(found, (weights, values), seed), gradients(expected, (weights, values), seed), strict=True
-    ):
-        torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-6)
-
-
-@settings(max_examples=60, deadline=None)
 @given(counts=counts_lists, seed=st.integers(0, 2**31), bound=st.sampled_from([0.0, 1e-4, 0.013, 0.5, 1.0]))
 def test_terminate(counts, seed, bound):
     tau, _, offsets = random_packed(seed, counts)
@@ -101,33 +89,18 @@ def test_terminate(counts, seed, bound):
     assert bool(found.all()) or bound > 0
 
 
-def test_only_the_wanted_gradient():
-    weights, values, offsets = random_packed(0, [3, 0, 4])
-    for wanted in (weights, values):
-        wanted.requires_grad_()
-        (found,) = gradients(composite.accumulate(weights, values, offsets), (wanted,), 0)
-        (expected,) = gradients(ops.accumulate.reference(weights, values, offsets), (wanted,), 0)
-        torch.testing.assert_close(found, expected)
-        wanted.requires_grad_(False)
-    assert not composite.accumulate(weights, values, offsets).requires_grad
-
-
 def test_opaque_and_strided():
     tau = torch.tensor([[0.5, 9.0], [math.inf, 9.0], [1.0, 9.0], [2.0, 9.0]])[:, 0].requires_grad_()
     offsets = torch.tensor([[0, 0], [3, 0], [4, 0]])[:, 0]
     found, expected = composite.composite_weights(tau, offsets), ops.composite_weights.reference(tau, offsets)
     torch.testing.assert_close(found, expected)
     torch.testing.assert_close(gradients(found, (tau,), 0), gradients(expected, (tau,), 0))
-    spread = torch.ones(1, 1).expand(4, 3)
-    torch.testing.assert_close(
-        composite.accumulate(found, spread, offsets), ops.accumulate.reference(expected, spread, offsets)
-    )
 
 
 def test_inputs_stay_as_they_were():
     tau, values, offsets = random_packed(0, [30] * 9)
     copies = tau.clone(), values.clone(), offsets.clone()
-    composite.accumulate(composite.composite_weights(tau, offsets), values, offsets)
+    colours_of(composite.composite_weights(tau, offsets), values, offsets)
     composite.terminate(tau, offsets, 0.1)
     for a, b in zip((tau, values, offsets), copies, strict=True):
         assert torch.equal(a, b)
@@ -141,7 +114,7 @@ def test_thread_count_does_not_matter():
 
     def everything():
         weights = composite.composite_weights(tau, offsets)
-        sums = composite.accumulate(weights, values, offsets)
+        sums = colours_of(weights, values, offsets)
         return weights, sums, composite.terminate(tau, offsets, 0.3), *gradients(sums, (tau, values), 1)
 
     try:
@@ -157,10 +130,10 @@ def test_thread_count_does_not_matter():
 def test_two_python_threads_at_once():
     """As a viewer renders beside a trainer."""
     tau, values, offsets = random_packed(7, [13, 0, 55] * 300)
-    expected = composite.accumulate(composite.composite_weights(tau, offsets), values, offsets)
+    expected = colours_of(composite.composite_weights(tau, offsets), values, offsets)
 
     def work(_):
-        return composite.accumulate(composite.composite_weights(tau, offsets), values, offsets)
+        return colours_of(composite.composite_weights(tau, offsets), values, offsets)
 
     with ThreadPoolExecutor(2) as pool:
         assert all(torch.equal(found, expected) for found in pool.map(work, range(60)))
@@ -173,7 +146,6 @@ def test_registered():
     with ops.use_backend("torch"):
         plain = ops.composite_weights.reference(tau, offsets)
         assert torch.equal(ops.composite_weights(tau, offsets), plain)
-    assert torch.equal(
-        ops.accumulate(weights, values, offsets), composite.accumulate(weights, values, offsets)
-    )
+    given_ = (weights, values, torch.rand(14), torch.rand(3, 3), offsets)
+    assert all(map(torch.equal, ops.pixels(*given_), composite.pixels(*given_)))
     assert torch.equal(ops.terminate(tau, offsets, 0.4), composite.terminate(tau, offsets, 0.4))

@@ -91,13 +91,6 @@ def composite_weights(optical_depth: Tensor, offsets: Tensor) -> Tensor:
     return torch.exp(-_depth_before(optical_depth, offsets)) * -torch.expm1(-optical_depth)
 
 
-def _check_sums(weights: Tensor, values: Tensor, offsets: Tensor) -> None:
-    check_packed(weights, offsets, "weights")
-    if values.dim() != 2 or values.shape[0] != weights.shape[0]:
-        raise InputError(f"values: found shape {tuple(values.shape)}, expected ({weights.shape[0]}, K)")
-
-
-@operation(check=_check_sums)
 def accumulate(weights: Tensor, values: Tensor, offsets: Tensor) -> Tensor:
     """Weighted sum of ``values`` along every ray (nerfacc's ``accumulate_along_rays``, a ``scatter_add`` elsewhere).
 
@@ -107,7 +100,7 @@ def accumulate(weights: Tensor, values: Tensor, offsets: Tensor) -> Tensor:
         offsets: ``(R + 1,)`` int64.
 
     Returns:
-        ``(R, K)``, 0 for rays without samples; differentiable once in both.
+        ``(R, K)``, 0 for rays without samples; differentiable in both.
 
     Raises:
         InputError: if the shapes do not fit.
@@ -116,6 +109,9 @@ def accumulate(weights: Tensor, values: Tensor, offsets: Tensor) -> Tensor:
         >>> accumulate(torch.tensor([0.5, 0.25]), torch.ones(2, 1), torch.tensor([0, 2, 2])).tolist()
         [[0.75], [0.0]]
     """
+    check_packed(weights, offsets, "weights")
+    if values.dim() != 2 or values.shape[0] != weights.shape[0]:
+        raise InputError(f"values: found shape {tuple(values.shape)}, expected ({weights.shape[0]}, K)")
     ray = ray_of_sample(offsets, weights.numel())
     sums = values.new_zeros(offsets.numel() - 1, values.shape[1])
     return sums.index_add(0, ray, weights[:, None] * values)
@@ -157,7 +153,7 @@ def pixels(
         [[[0.75, 0.75, 0.75]], [0.75], [1.0]]
     """
     stacked = torch.cat([colours, t[:, None], torch.ones_like(t[:, None])], dim=-1)
-    total = accumulate.reference(weights, stacked, offsets)
+    total = accumulate(weights, stacked, offsets)
     opacity = total[:, 4]
     return total[:, :3] + (1 - opacity)[:, None] * background, opacity, total[:, 3]
 

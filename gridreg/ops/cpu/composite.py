@@ -1,4 +1,4 @@
-"""Compiled compositing along rays: weights, weighted sums and early termination, with their gradients."""
+"""Compiled compositing along rays: weights, pixels and early termination, with their gradients."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from gridreg.ops.cpu.jit.compiler import (
 )
 from gridreg.ops.cpu.jit.launch import launch
 
-__all__ = ["accumulate", "composite_weights", "pixels", "terminate"]
+__all__ = ["composite_weights", "pixels", "terminate"]
 
 # Rays of one task.
 _RAYS = 64
@@ -78,73 +78,6 @@ class _Weights(Function):
         result = torch.empty_like(weights)
         launch(_weights_backward, _tasks(offsets), offsets, weights, after, gradient.contiguous(), result)
         return result, None
-
-
-@kernel
-def _sums_forward(
-    task: int, offsets: Vector[int64], weights: Vector[float32], values: Matrix[float32],
-    sums: Matrix[float32],
-) -> None:  # fmt: skip
-    """``sum_n w_n v_n`` of every ray."""
-    rays, samples, channels = offsets.shape[0] - 1, weights.shape[0], values.shape[1]
-    for ray in range(task * _RAYS, min((task + 1) * _RAYS, rays)):
-        total = sums[ray]
-        for k in range(channels):
-            total[k] = float32(0)
-        for n in range(max(offsets[ray], 0), min(offsets[ray + 1], samples)):
-            for k in range(channels):
-                total[k] += weights[n] * values[n, k]
-
-
-@kernel
-def _sums_backward(
-    task: int, offsets: Vector[int64], weights: Vector[float32], values: Matrix[float32],
-    gradient: Matrix[float32], of_weights: Vector[float32], of_values: Matrix[float32], want_weights: int64,
-    want_values: int64,
-) -> None:  # fmt: skip
-    """Gradients with respect to the weights and, where wanted, the values."""
-    rays, samples, channels = offsets.shape[0] - 1, weights.shape[0], values.shape[1]
-    for ray in range(task * _RAYS, min((task + 1) * _RAYS, rays)):
-        for n in range(max(offsets[ray], 0), min(offsets[ray + 1], samples)):
-            if want_weights:
-                total = float32(0)
-                for k in range(channels):
-                    total += gradient[ray, k] * values[n, k]
-                of_weights[n] = total
-            if want_values:
-                for k in range(channels):
-                    of_values[n, k] = weights[n] * gradient[ray, k]
-
-
-class _Sums(Function):
-    @staticmethod
-    def forward(ctx: Any, weights: Tensor, values: Tensor, offsets: Tensor) -> Tensor:
-        weights, values = weights.contiguous(), values.contiguous()
-        sums = torch.empty(offsets.numel() - 1, values.shape[1])
-        launch(_sums_forward, _tasks(offsets), offsets, weights, values, sums)
-        ctx.save_for_backward(offsets, weights, values)
-        return sums
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
-        offsets, weights, values = ctx.saved_tensors
-        want_weights, want_values = ctx.needs_input_grad[:2]
-        of_weights = torch.empty_like(weights) if want_weights else weights
-        of_values = torch.empty_like(values) if want_values else values
-        launch(
-            _sums_backward,
-            _tasks(offsets),
-            offsets,
-            weights,
-            values,
-            gradient.contiguous(),
-            of_weights,
-            of_values,
-            int(want_weights),
-            int(want_values),
-        )
-        return of_weights if want_weights else None, of_values if want_values else None, None
 
 
 @kernel
@@ -231,12 +164,6 @@ def _seen(
 def composite_weights(optical_depth: Tensor, offsets: Tensor) -> Tensor:
     """See `gridreg.ops.composite_weights`."""
     return _Weights.apply(optical_depth, offsets.contiguous())  # type: ignore[no-any-return, no-untyped-call]
-
-
-@ops.accumulate.register_cpu()
-def accumulate(weights: Tensor, values: Tensor, offsets: Tensor) -> Tensor:
-    """See `gridreg.ops.accumulate`."""
-    return _Sums.apply(weights, values, offsets.contiguous())  # type: ignore[no-any-return, no-untyped-call]
 
 
 @ops.pixels.register_cpu(suits=ops.pixels_suit_cpu)
