@@ -24,7 +24,6 @@ from gridreg.export import (
     Lens,
     Mesh,
     compare_meshes,
-    model_of_trainer,
     orbit_of_box,
     read_mesh,
     save_mesh,
@@ -73,7 +72,7 @@ def reconstruct(subject: Path, protocol: str, arguments: argparse.Namespace) -> 
         mesh = write_mesh(
             trainer.field, Path(out) / "mesh.ply", trainer.occupancy, resolution=arguments.resolution
         )
-        model = model_of_trainer(trainer)
+        model = trainer.model
         renders = [to_image(model.render(camera), "rgb") for camera in cameras(truth)]  # type: ignore[arg-type]
     comparison = compare_meshes(mesh, truth)
     metrics["config"] = {**metrics["config"], "scene": subject.name}

@@ -70,7 +70,7 @@ def joined_record(
     """Return the score of loaded runs joined, beside the metrics that each of them has ``alone``."""
     joined = ensemble_of(members)
     began = time.perf_counter()
-    scored = score_views(joined.field, scene.test, joined.occupancy, joined.march, joined.background)
+    scored = score_views(joined, scene.test)
     return metrics_record(
         {view.name: view.metrics for view in scored},
         scene=scene.name,

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 import gridreg
 from gridreg.export.cameras import look_at
-from gridreg.export.model import Model
+from gridreg.rendering.model import Model
 from gridreg.scenes import Views
 
 Function = Callable[[Tensor], Tensor]

@@ -13,7 +13,6 @@ from torch import Tensor, nn
 
 from gridreg.cli import main
 from gridreg.errors import InputError
-from gridreg.export import model_of_run
 from gridreg.export.preview import Preview
 from gridreg.rendering import Ensemble, MarchSettings, OccupancyGrid, Rays, render_rays
 from gridreg.scenes import builtin_scene, load_scene
@@ -161,7 +160,7 @@ def test_ensembles_join_by_their_members(desk, tmp_path):
 def test_a_viewer_copies_it_masks_included(desk, tmp_path):
     save_ensemble([desk / "a", desk / "b"], tmp_path)
     run = load_run(tmp_path)
-    preview = Preview(model_of_run(run))
+    preview = Preview(run)
     assert preview.masks == ()
     x = run.field.bounds.mean(0) + 0.3 * torch.randn(200, 3, generator=torch.Generator().manual_seed(0))
     assert torch.equal(preview.at().field.density(x), run.field.density(x))

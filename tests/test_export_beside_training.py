@@ -12,11 +12,12 @@ import torch
 import gridreg
 from backbones.vm import VMField
 from gridreg.export.camera_paths import turntable
-from gridreg.export.cameras import Lens, orbit_of_box
-from gridreg.export.model import Model
+from gridreg.export.cameras import orbit_of_box
 from gridreg.export.preview import Preview
 from gridreg.export.viewer import Viewer
 from gridreg.rendering import MarchSettings, OccupancyGrid, Rays, render_rays
+from gridreg.rendering.cameras import Lens
+from gridreg.rendering.model import Model
 from tests.export_viewing import FakeClient
 
 BOUNDS = torch.tensor([[-1.0] * 3, [1.0] * 3])

@@ -12,7 +12,8 @@ import torch
 from gridreg.errors import InputError
 from gridreg.export.camera_files import load_cameras, save_cameras
 from gridreg.export.camera_paths import turntable
-from gridreg.export.cameras import Lens, look_at, orbit_of_box
+from gridreg.export.cameras import look_at, orbit_of_box
+from gridreg.rendering.cameras import Lens
 
 LENS = Lens.from_angle(45.0, 30, 40)
 BOX = torch.tensor([[-1.0, -1, -1], [1, 1, 1]])

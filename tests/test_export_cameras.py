@@ -21,8 +21,9 @@ from gridreg.export.camera_paths import (
     tour,
     turntable,
 )
-from gridreg.export.cameras import Camera, Lens, look_at, orbit_of_box, orbit_of_views, up_axis
+from gridreg.export.cameras import look_at, orbit_of_box, orbit_of_views, up_axis
 from gridreg.rendering import camera_rays
+from gridreg.rendering.cameras import Camera, Lens
 from gridreg.scenes import Views
 from tests.export_fields import ring_of_views
 

@@ -12,10 +12,10 @@ import torch
 from gridreg.errors import InputError
 from gridreg.export import writers
 from gridreg.export.camera_paths import camera_path
-from gridreg.export.cameras import Camera
-from gridreg.export.model import Model
 from gridreg.export.video import render_video
 from gridreg.export.writers import write_video
+from gridreg.rendering.cameras import Camera
+from gridreg.rendering.model import Model
 from tests.export_fields import AnalyticField, ball, ring_of_views
 
 

@@ -8,9 +8,9 @@ from torch import nn
 
 import gridreg
 from gridreg.errors import InputError
-from gridreg.export.model import Model
 from gridreg.export.pace import Pace
 from gridreg.export.preview import Preview
+from gridreg.rendering.model import Model
 from tests.export_fields import MaskedBall, ball_model
 
 

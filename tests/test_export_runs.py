@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from gridreg.errors import InputError
-from gridreg.export import LiveView, draw_run, live_view, model_of_run, model_of_trainer, video_path
-from gridreg.export.cameras import Camera, Lens
+from gridreg.export import LiveView, draw_run, live_view, video_path
+from gridreg.rendering.cameras import Camera, Lens
 from gridreg.scenes import Scene, builtin_scene, load_scene
 from gridreg.training import Execution, RunConfig, build_trainer, execute, load_run
 from gridreg.training.curves import History
@@ -45,9 +45,10 @@ def started(scene: Scene, out: Path) -> Execution:
 def test_a_loaded_run_looks_like_the_trained_one(scene: Scene, tmp_path: Path) -> None:
     run, _ = execute(CONFIG, scene, tmp_path / "run")
     run.trainer.field.eval()
-    camera = Camera(scene.train.poses[0], Lens.of_views(scene.train))
-    trained = model_of_trainer(run.trainer)
-    loaded = model_of_run(load_run(tmp_path / "run"))
+    views = scene.train
+    camera = Camera(views.poses[0], Lens.from_tensor(views.intrinsics[0], views.height, views.width))
+    trained = run.trainer.model
+    loaded = load_run(tmp_path / "run")
     assert loaded.handle is not None
     assert loaded.handle.current_step == 6
     # The mask is never fully open, so a dropped handle would be seen.
@@ -63,14 +64,14 @@ def test_a_loaded_run_looks_like_the_trained_one(scene: Scene, tmp_path: Path) -
 
 
 def test_video_paths(scene: Scene, forward: Scene) -> None:
-    model = model_of_trainer(build_trainer(CONFIG, scene))
+    model = build_trainer(CONFIG, scene).model
     assert len(video_path(model, None, frames=3)) == 3
     turn = video_path(model, scene.train, frames=4, width=8)
     assert {camera.lens.width for camera in turn} == {8}
     # Once around: opposite cameras look in opposite directions across the vertical axis.
     assert float(turn[0].pose[:2, 2] @ turn[2].pose[:2, 2]) < 0
 
-    facing = model_of_trainer(build_trainer(CONFIG, forward))
+    facing = build_trainer(CONFIG, forward).model
     assert facing.warp == warp_of(forward)
     sway = video_path(facing, forward.train, frames=5)
     assert all(float(camera.pose[2, 2]) > 0.9 for camera in sway)

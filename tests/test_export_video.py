@@ -15,12 +15,12 @@ from PIL import Image
 
 from gridreg.errors import InputError
 from gridreg.export.camera_paths import camera_path
-from gridreg.export.cameras import Camera, Lens
 from gridreg.export.images import colour_bar, depth_range, to_image
-from gridreg.export.model import Model
 from gridreg.export.video import render_frames, render_video
 from gridreg.export.writers import write_video
 from gridreg.rendering import Rays, Rendered
+from gridreg.rendering.cameras import Camera, Lens
+from gridreg.rendering.model import Model
 from gridreg.training.images import row
 from tests.export_fields import AnalyticField, ball, ring_of_views
 

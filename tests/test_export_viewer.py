@@ -17,9 +17,9 @@ from gridreg.errors import InputError
 from gridreg.export.browser import camera_of, image_shape, start_server
 from gridreg.export.cameras import look_at
 from gridreg.export.images import z_depth
-from gridreg.export.model import Model
 from gridreg.export.viewer import Viewer
 from gridreg.rendering import Rendered, camera_rays
+from gridreg.rendering.model import Model
 from tests.export_fields import AnalyticField, ball, ball_model, ring_of_views
 from tests.export_viewing import FakeClient
 

@@ -1,4 +1,4 @@
-"""PSNR and SSIM against scikit-image, against TensoRF's own SSIM, and against their definitions."""
+"""PSNR and SSIM against TensoRF's own SSIM, and against their definitions."""
 
 from __future__ import annotations
 
@@ -11,15 +11,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import convolve2d
-from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+from skimage.metrics import peak_signal_noise_ratio
 
 from gridreg.errors import InputError
 from gridreg.training import metrics
-
-SKIMAGE = {
-    "gaussian": {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False},
-    "uniform": {},
-}
 
 
 def image_pair(
@@ -55,6 +50,17 @@ def tensorf_rgb_ssim(a: np.ndarray, b: np.ndarray) -> float:
     return float((numerator / ((mu0**2 + mu1**2 + 1e-4) * (s00 + s11 + 9e-4))).mean())
 
 
+def uniform_ssim(a: np.ndarray, b: np.ndarray) -> float:
+    """Wang et al. 2004, equation 13, over every whole window of 7x7, with sample covariances."""
+    x, y = (np.lib.stride_tricks.sliding_window_view(z, (7, 7), axis=(0, 1)) for z in (a, b))
+    mx, my = x.mean((-1, -2)), y.mean((-1, -2))
+    vx, vy = x.var((-1, -2), ddof=1), y.var((-1, -2), ddof=1)
+    cov = ((x - mx[..., None, None]) * (y - my[..., None, None])).sum((-1, -2)) / 48
+    return float(
+        ((2 * mx * my + 1e-4) * (2 * cov + 9e-4) / ((mx**2 + my**2 + 1e-4) * (vx + vy + 9e-4))).mean()
+    )
+
+
 @pytest.mark.parametrize("convention", ["gaussian", "uniform"])
 @settings(max_examples=25, deadline=None)
 @given(
@@ -63,18 +69,11 @@ def tensorf_rgb_ssim(a: np.ndarray, b: np.ndarray) -> float:
     width=st.integers(11, 40),
     noise=st.floats(0, 1),
 )
-def test_ssim_equals_scikit_image(convention, seed, height, width, noise):
+def test_ssim_is_what_the_papers_compute(convention, seed, height, width, noise):
     a, b = image_pair(seed, height, width, noise)
-    expected = structural_similarity(a, b, data_range=1.0, channel_axis=-1, **SKIMAGE[convention])
+    reference = tensorf_rgb_ssim if convention == "gaussian" else uniform_ssim
     got = metrics.ssim(torch.from_numpy(a), torch.from_numpy(b), convention)
-    assert got == pytest.approx(expected, abs=1e-11)
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_gaussian_ssim_equals_tensorfs_valid_convolution(seed):
-    a, b = image_pair(seed)
-    got = metrics.ssim(torch.from_numpy(a), torch.from_numpy(b), "gaussian")
-    assert got == pytest.approx(tensorf_rgb_ssim(a, b), abs=1e-11)
+    assert got == pytest.approx(reference(a, b), abs=1e-11)
 
 
 def test_the_conventions_are_different_numbers():
@@ -135,15 +134,6 @@ def test_inputs_and_gradients_are_left_alone():
     assert a.grad is None
 
 
-def test_mean_psnr_is_the_mean_of_the_images():
-    pairs = [tuple(map(torch.from_numpy, image_pair(s, noise=0.02 * (s + 1)))) for s in range(3)]
-    each = [metrics.psnr(a, b) for a, b in pairs]
-    got = metrics.mean_psnr((a for a, _ in pairs), (b for _, b in pairs))
-    assert got == pytest.approx(np.mean(each), abs=1e-12)
-    error = torch.cat([(a - b).flatten() for a, b in pairs]).square().mean()
-    assert abs(got - metrics.mse_to_psnr(float(error))) > 0.1
-
-
 def test_image_and_mean_metrics():
     rows = [metrics.image_metrics(*map(torch.from_numpy, image_pair(s))) for s in range(3)]
     assert list(rows[0]) == ["psnr", "ssim_gaussian", "ssim_uniform"]
@@ -166,14 +156,6 @@ def test_numbers_for_json():
     assert math.isnan(float(metrics.json_number(math.nan)))
 
 
-def test_window_weights():
-    like = torch.zeros((), dtype=torch.float64)
-    window = metrics._gaussian_window(like).numpy()
-    assert window.sum() == pytest.approx(1, abs=1e-15)
-    assert window[5] / window[8] == pytest.approx(math.exp(0.5 * 9 / 2.25), rel=1e-12)
-    assert np.array_equal(window, window[::-1])
-
-
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -183,8 +165,6 @@ def test_window_weights():
         (lambda: metrics.ssim(torch.zeros(10, 20, 3), torch.zeros(10, 20, 3)), "11 or more each way"),
         (lambda: metrics.ssim(torch.zeros(9, 6, 3), torch.zeros(9, 6, 3), "uniform"), "7 or more each way"),
         (lambda: metrics.ssim(torch.zeros(9, 9, 3), torch.zeros(9, 9, 3), "box"), "gaussian, uniform"),
-        (lambda: metrics.mean_psnr([], []), "at least one"),
-        (lambda: metrics.mean_psnr([torch.zeros(4, 4, 3)], []), "1 and 0"),
         (lambda: metrics.mean_metrics([]), "at least one"),
         (lambda: metrics.mean_metrics([{"psnr": 1.0}, {"ssim": 1.0}]), "expected the same"),
     ],

@@ -11,7 +11,16 @@ from hypothesis import strategies as st
 import gridreg
 from backbones.mlp import MLPField
 from gridreg.fields import make_field
-from gridreg.rendering import MarchSettings, OccupancyGrid, Rays, box_intersection, render_image, render_rays
+from gridreg.rendering import (
+    Camera,
+    Lens,
+    MarchSettings,
+    Model,
+    OccupancyGrid,
+    Rays,
+    box_intersection,
+    render_rays,
+)
 from gridreg.scenes import builtin_scene, load_scene
 from gridreg.training import RunConfig, TrainSettings, build_trainer, load_run, save_run
 
@@ -295,8 +304,9 @@ def test_pictures_hardly_depend_on_the_chunk_size():
     pose = torch.eye(4)
     pose[:3, 3] = torch.tensor([0.0, -0.5, 7.0])
     grid = OccupancyGrid.full(BOX, (4, 4, 4))
-    camera = (pose, torch.tensor([12.0, 12.0, 4.0, 4.0]), 8, 8, grid, MarchSettings(0.5))
-    one, two = (render_image(field, *camera, background=torch.ones(3), chunk=c).colour for c in (64, 5))
+    camera = Camera(pose, Lens((12.0, 12.0, 4.0, 4.0), 8, 8))
+    model = Model(field, grid, MarchSettings(0.5))
+    one, two = (model.render(camera, chunk=c).colour for c in (64, 5))
     torch.testing.assert_close(one, two, atol=1e-5, rtol=0)
     assert float(one.std()) > 0.01
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from gridreg.rendering import OccupancyGrid, Rays, camera_rays, pixel_rays, render_image
+from gridreg.rendering import Camera, Lens, OccupancyGrid, Rays, camera_rays, pixel_rays
 from gridreg.scenes import Scene, builtin_scene, load_scene, ndc_rays
 from gridreg.training import RunConfig, TrainSettings, build_trainer, execute, load_run
 from gridreg.training.evaluate import mean_psnr_of
@@ -100,7 +100,7 @@ def test_training_in_normalised_coordinates(scene: Scene, tmp_path: Path) -> Non
     # Carving asked for by a preset is left out: silhouettes mean nothing to these cells.
     run, metrics = execute(CONFIG, scene, tmp_path / "out")
     assert metrics is not None
-    assert not run.trainer.carves
+    assert not run.trainer.space.carves
     flat = scene.train.composited("white").mean(dim=(0, 1, 2))
     baseline = -10 * torch.log10((scene.test.composited("white") - flat).square().mean())
     assert metrics["mean"]["psnr"] > float(baseline) + 3
@@ -108,30 +108,17 @@ def test_training_in_normalised_coordinates(scene: Scene, tmp_path: Path) -> Non
 
     loaded = load_run(tmp_path / "out")
     assert loaded.warp == warp_of(scene)
-    again = mean_psnr_of(
-        loaded.field, scene.test, loaded.occupancy, loaded.march, loaded.background, warp=loaded.warp
-    )
+    again = mean_psnr_of(loaded, scene.test)
     assert again == pytest.approx(metrics["mean"]["psnr"], abs=1e-4)
-    unwarped = mean_psnr_of(loaded.field, scene.test, loaded.occupancy, loaded.march, loaded.background)
+    unwarped = mean_psnr_of(replace(loaded, warp=None), scene.test)
     assert unwarped < again - 3
 
 
 def test_pictures_do_not_depend_on_chunks(scene: Scene) -> None:
     trainer = build_trainer(replace(CONFIG, composition=[]), scene)
     view = scene.test
-    pictures = [
-        render_image(
-            trainer.field,
-            view.poses[0],
-            view.intrinsics[0],
-            view.height,
-            view.width,
-            OccupancyGrid.full(trainer.field.bounds, (8, 8, 8)),
-            trainer.march,
-            background=scene.background,
-            warp=trainer.warp,
-            chunk=chunk,
-        ).colour
-        for chunk in (100, 4096)
-    ]
+    camera = Camera(view.poses[0], Lens.from_tensor(view.intrinsics[0], view.height, view.width))
+    full = OccupancyGrid.full(trainer.field.bounds, (8, 8, 8))
+    model = replace(trainer.model, occupancy=full)
+    pictures = [model.render(camera, chunk=chunk).colour for chunk in (100, 4096)]
     torch.testing.assert_close(pictures[0], pictures[1])

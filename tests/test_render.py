@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import nn
 
-from gridreg.rendering import MarchSettings, OccupancyGrid, Rays, render_image, render_rays
+from gridreg.rendering import Camera, Lens, MarchSettings, Model, OccupancyGrid, Rays, render_rays
 
 
 class Sphere(nn.Module):
@@ -127,29 +127,25 @@ def test_a_ray_that_misses_the_box_has_no_samples():
 def camera(distance=4.0):
     pose = torch.eye(4)
     pose[2, 3] = distance
-    return pose, torch.tensor([40.0, 40.0, 16.0, 12.0])
+    return Camera(pose, Lens((40.0, 40.0, 16.0, 12.0), 24, 32))
 
 
 def test_pictures_do_not_depend_on_the_chunk_size():
-    field, (pose, intrinsics) = Sphere(), camera()
+    field = Sphere()
     grid = OccupancyGrid.full(field.bounds, (8, 8, 8))
-    pictures = [
-        render_image(
-            field, pose, intrinsics, 24, 32, grid, MarchSettings(0.05), background=WHITE, chunk=chunk
-        )
-        for chunk in (7, 100, 10_000)
-    ]
+    model = Model(field, grid, MarchSettings(0.05), WHITE)
+    pictures = [model.render(camera(), chunk=chunk) for chunk in (7, 100, 10_000)]
     for other in pictures[1:]:
         assert torch.equal(pictures[0].colour, other.colour)
         assert torch.equal(pictures[0].depth, other.depth)
 
 
 def test_a_picture_is_not_mirrored():
-    field, (pose, intrinsics) = Sphere(0.3, 30.0), camera()
+    field = Sphere(0.3, 30.0)
     field.register_buffer("centre", torch.tensor([0.8, 0.5, 0.0]))
     field.density = lambda x: torch.where((x - field.centre).norm(dim=-1) < 0.3, 30.0, 0.0)
     grid = OccupancyGrid.full(field.bounds, (8, 8, 8))
-    out = render_image(field, pose, intrinsics, 24, 32, grid, MarchSettings(0.05), background=WHITE)
+    out = Model(field, grid, MarchSettings(0.05), WHITE).render(camera())
     rows, columns = (out.opacity > 0.5).nonzero(as_tuple=True)
     # x = 0.8, y = 0.5 at depth about 4: right of the centre and above it.
     assert columns.float().mean().item() + 0.5 == pytest.approx(16 + 40 * 0.8 / 4, abs=0.8)

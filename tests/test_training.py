@@ -248,11 +248,11 @@ def test_learning_rates_decay_and_start_anew_at_resampling(scene, config):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"steps": 0}, "train.steps: found 0"),
-        ({"rays": -1}, "train.rays: found -1"),
-        ({"learning_rate_grid": math.nan}, "train.learning_rate_grid: found nan"),
-        ({"shrink_at": (7,)}, "train.shrink_at: found 7"),
-        ({"average_from": 1.5}, "train.average_from: found 1.5"),
+        ({"steps": 0}, "steps: found 0"),
+        ({"rays": -1}, "rays: found -1"),
+        ({"learning_rate_grid": math.nan}, "learning_rate_grid: found nan"),
+        ({"shrink_at": (7,)}, "shrink_at: found 7"),
+        ({"average_from": 1.5}, "average_from: found 1.5"),
     ],
 )
 def test_settings_out_of_range_are_named(change, message):

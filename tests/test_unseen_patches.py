@@ -139,8 +139,8 @@ def test_depth_of_unseen_views_is_smoother_with_the_penalty(scene):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"patches": 0}, "train.patches: found 0, expected an integer of at least 1"),
-        ({"patch_size": 1}, "train.patch_size: found 1, expected an integer of at least 2"),
+        ({"patches": 0}, "patches: found 0, expected an integer of at least 1"),
+        ({"patch_size": 1}, "patch_size: found 1, expected an integer of at least 2"),
     ],
 )
 def test_settings_out_of_range(settings, message):
@@ -150,5 +150,5 @@ def test_settings_out_of_range(settings, message):
 
 def test_a_patch_larger_than_the_pictures(scene):
     config = replace(CONFIG, train=replace(CONFIG.train, patch_size=33), composition=[SMOOTH])
-    with pytest.raises(InputError, match=r"train.patch_size: found 33, .* the pictures' 32 pixels"):
+    with pytest.raises(InputError, match=r"train.patch_size: found 33, .* the images' 32 pixels"):
         build_trainer(config, scene)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import time
 
-from gridreg.rendering import render_image
+from gridreg.rendering import Camera, Lens
 from gridreg.training import build_trainer
 
 from . import common
@@ -35,19 +35,11 @@ def measure(arguments: argparse.Namespace) -> tuple[Record, str]:
         height = round(width * views.height / views.width)
         times = []
         for turn, view in enumerate([chosen[0], *chosen]):
-            # One picture goes before those that count.
+            # One image goes before those that count.
+            intrinsics = views.intrinsics[view] * (width / views.width)
+            camera = Camera(views.poses[view], Lens.from_tensor(intrinsics, height, width))
             began = time.perf_counter()
-            render_image(
-                trainer.field,
-                views.poses[view],
-                views.intrinsics[view] * (width / views.width),
-                height,
-                width,
-                trainer.occupancy,
-                trainer.march,
-                background=scene.background,
-                warp=trainer.warp,
-            )
+            trainer.model.render(camera)
             if turn:
                 times.append(time.perf_counter() - began)
         sizes[str(width)] = {"height": height, "seconds": common.spread(times)}

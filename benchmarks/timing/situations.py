@@ -15,7 +15,7 @@ from gridreg.errors import InputError
 from gridreg.ops import use_backend
 from gridreg.rendering import OccupancyGrid, Rays
 from gridreg.scenes import Scene
-from gridreg.training import RunConfig, Trainer, build_trainer, events, load_preset, load_run, regularizers_of
+from gridreg.training import RunConfig, Trainer, build_trainer, load_preset, load_run, regularizers_of
 
 
 @dataclass(frozen=True)
@@ -177,12 +177,13 @@ def late(
     trainer = Trainer(field, scene, regularizers_of(config), settings, seed=config.seed)
     trainer.step = middle
     if trained is not None:
-        trainer.occupancy = run.occupancy
+        trainer.space.occupancy = run.occupancy
     else:
         if hasattr(field, "resample"):
-            events.resample(trainer)
-        events.update_occupancy(trainer)
-    events.filter_rays(trainer)
+            trainer.space.resample(middle)
+            trainer.restart_optimizer()
+        trainer.space.update(middle)
+    trainer.space.filter_rays()
     trainer.train(until=min(middle + warm_up, settings.steps))
     return _still(trainer, name, middle)
 

@@ -54,15 +54,7 @@ def run(options: EvalOptions) -> int:
         if folder is not None:
             save_scored(folder, view)
 
-    scored = score_views(
-        loaded.field,
-        scene.test,
-        loaded.occupancy,
-        loaded.march,
-        loaded.background,
-        each,
-        warp=loaded.warp,
-    )
+    scored = score_views(loaded, scene.test, each)
     record = metrics_record(
         {view.name: view.metrics for view in scored},
         scene=scene.name,

@@ -50,7 +50,7 @@ def run(options: RenderOptions) -> int:
     """
     from gridreg.cli.runs import folder_of, views_scene
     from gridreg.errors import InputError
-    from gridreg.export import model_of_run, render_video, video_path
+    from gridreg.export import render_video, video_path
     from gridreg.training import load_run
     from gridreg.training.progress import Progress
 
@@ -63,9 +63,8 @@ def run(options: RenderOptions) -> int:
     scene = views_scene(runs[0], first, options.scene)
     if scene is None:
         print(f"{runs[0].config.scene}: not there any more, so the path follows the box", file=sys.stderr)
-    models = [model_of_run(run) for run in runs]
     cameras = video_path(
-        models[0],
+        runs[0],
         None if scene is None else scene.train,
         options.path,
         frames=options.frames,
@@ -73,11 +72,11 @@ def run(options: RenderOptions) -> int:
         elevation=options.elevation,
         radius=options.radius,
     )
-    name = Path(options.path).stem if options.path else "spiral" if models[0].warp else "turntable"
+    name = Path(options.path).stem if options.path else "spiral" if runs[0].warp else "turntable"
     target = options.out if options.out is not None else folder_of(first) / f"{name}.mp4"
     with Progress(len(cameras), label="frame") as progress:
         render_video(
-            models,
+            runs,
             target,
             cameras,
             modes=options.modes,

@@ -33,7 +33,7 @@ def run(options: ViewOptions) -> int:
         InputError: for a missing or damaged checkpoint, without viser, or if the port is taken.
     """
     from gridreg.cli.runs import views_scene
-    from gridreg.export import Viewer, model_of_run
+    from gridreg.export import Viewer
     from gridreg.export.browser import check_address
     from gridreg.training import load_run
 
@@ -43,8 +43,6 @@ def run(options: ViewOptions) -> int:
     if scene is None:
         print(f"{loaded.config.scene}: not there any more, so no training cameras", file=sys.stderr)
     views = None if scene is None else scene.train
-    with Viewer(
-        model_of_run(loaded), views, host=options.host, port=options.port, size=options.size
-    ) as viewer:
+    with Viewer(loaded, views, host=options.host, port=options.port, size=options.size) as viewer:
         viewer.wait()
     return 0

@@ -2,22 +2,21 @@
 
 from gridreg.export.camera_files import load_cameras, save_cameras
 from gridreg.export.camera_paths import CAMERA_PATHS, camera_path, spiral, sway, tour, turntable
-from gridreg.export.cameras import Camera, Lens, Orbit, look_at, orbit_of_box, orbit_of_views
+from gridreg.export.cameras import Orbit, look_at, orbit_of_box, orbit_of_views
 from gridreg.export.compare import MeshComparison, compare_meshes
 from gridreg.export.images import MODES, to_image
 from gridreg.export.mesh import Mesh, extract_mesh, read_mesh, save_mesh, write_mesh
-from gridreg.export.model import Model
 from gridreg.export.runs import (
     LiveView,
     check_drawing,
     draw_run,
     live_view,
-    model_of_run,
-    model_of_trainer,
     video_path,
 )
 from gridreg.export.video import render_frames, render_video
 from gridreg.export.viewer import Viewer
+from gridreg.rendering.cameras import Camera, Lens
+from gridreg.rendering.model import Model
 
 __all__ = [
     "CAMERA_PATHS",
@@ -39,8 +38,6 @@ __all__ = [
     "live_view",
     "load_cameras",
     "look_at",
-    "model_of_run",
-    "model_of_trainer",
     "orbit_of_box",
     "orbit_of_views",
     "to_image",

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from gridreg.errors import InputError
 from gridreg.export._admission import Admission
-from gridreg.export.cameras import Camera, Lens
+from gridreg.rendering.cameras import Camera, Lens
 from gridreg.scenes import Views
 
 __all__ = ["add_frustums", "camera_of", "check_address", "image_shape", "quiet_console", "start_server"]

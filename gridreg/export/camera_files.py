@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from gridreg.errors import InputError
-from gridreg.export.cameras import Camera, Lens
+from gridreg.rendering.cameras import Camera, Lens
 from gridreg.scenes.gate import check_pose
 from gridreg.training.files import write_json
 

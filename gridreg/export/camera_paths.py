@@ -12,7 +12,8 @@ from torch import Tensor
 
 from gridreg.errors import InputError
 from gridreg.export.camera_files import load_cameras
-from gridreg.export.cameras import Camera, Lens, Orbit, Vector, look_at, orbit_of_box, orbit_of_views, up_axis
+from gridreg.export.cameras import Orbit, Vector, look_at, orbit_of_box, orbit_of_views, up_axis
+from gridreg.rendering.cameras import Camera, Lens
 from gridreg.scenes import Views
 from gridreg.scenes.extent import focus_point
 
@@ -57,7 +58,11 @@ def camera_path(
     Raises:
         InputError: for an unknown name, numbers out of range, "train" without views, or a bad file.
     """
-    lens = Lens.from_angle(40.0, 400, 400) if views is None else Lens.of_views(views)
+    lens = (
+        Lens.from_angle(40.0, 400, 400)
+        if views is None
+        else Lens.from_tensor(views.intrinsics[0], views.height, views.width)
+    )
     lens = lens if width is None else lens.resized(width)
     if str(name) not in CAMERA_PATHS:
         if not Path(name).is_file():

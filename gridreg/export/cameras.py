@@ -1,4 +1,4 @@
-"""Cameras of our own, and the orbit on which the cameras of a scene stand."""
+"""Where to put cameras: looking at a point, on the orbit on which the cameras of a scene stand."""
 
 from __future__ import annotations
 
@@ -14,71 +14,9 @@ from gridreg.errors import InputError
 from gridreg.scenes import Views
 from gridreg.scenes.extent import focus_point
 
-__all__ = ["Camera", "Lens", "Orbit", "look_at", "orbit_of_box", "orbit_of_views", "up_axis"]
+__all__ = ["Orbit", "look_at", "orbit_of_box", "orbit_of_views", "up_axis"]
 
 Vector = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Lens:
-    """Intrinsics and size of an image.
-
-    Args:
-        intrinsics: fx, fy, cx, cy in pixels.
-        height, width: pixels.
-    """
-
-    intrinsics: tuple[float, float, float, float]
-    height: int
-    width: int
-
-    def __post_init__(self) -> None:
-        if self.height < 1 or self.width < 1:
-            raise InputError(f"size: found {self.width}x{self.height}, expected at least 1x1 pixels")
-        if not (np.isfinite(self.intrinsics).all() and min(self.intrinsics[:2]) > 0):
-            raise InputError(
-                f"intrinsics={self.intrinsics}: expected finite fx, fy, cx, cy with fx, fy above 0"
-            )
-
-    @classmethod
-    def from_angle(cls, degrees: float, height: int, width: int) -> Lens:
-        """A lens with a horizontal field of view, its axis through the middle of the image.
-
-        Example:
-            >>> Lens.from_angle(90.0, 100, 200).intrinsics
-            (100.0, 100.0, 100.0, 50.0)
-        """
-        if not 0 < degrees < 180:
-            raise InputError(f"angle={degrees}: expected degrees between 0 and 180")
-        focal = round(width / 2 / math.tan(math.radians(degrees) / 2), 9)
-        return cls((focal, focal, width / 2, height / 2), height, width)
-
-    @classmethod
-    def of_views(cls, views: Views) -> Lens:
-        """The lens of the first of some views."""
-        fx, fy, cx, cy = (float(v) for v in views.intrinsics[0])
-        return cls((fx, fy, cx, cy), views.height, views.width)
-
-    def resized(self, width: int) -> Lens:
-        """The same view in an image of another width; the height follows."""
-        factor = width / self.width
-        fx, fy, cx, cy = self.intrinsics
-        height = max(1, round(self.height * factor))
-        vertical = height / self.height
-        return Lens((fx * factor, fy * vertical, cx * factor, cy * vertical), height, width)
-
-
-@dataclass(frozen=True)
-class Camera:
-    """A lens at a place.
-
-    Args:
-        pose: camera-to-world ``(4, 4)`` float32, looking along -z with y up in the image.
-        lens: intrinsics and size.
-    """
-
-    pose: Tensor
-    lens: Lens
 
 
 def look_at(position: Vector, target: Vector, up: Vector) -> Tensor:

@@ -12,8 +12,8 @@ from torch import nn
 import gridreg
 from gridreg import Handle, Regularizer
 from gridreg.errors import InputError
-from gridreg.export.model import Model
 from gridreg.rendering import OccupancyGrid
+from gridreg.rendering.model import Model
 
 __all__ = ["Preview"]
 

@@ -11,16 +11,16 @@ from typing import TYPE_CHECKING, Any
 from gridreg.errors import InputError
 from gridreg.export.browser import check_address
 from gridreg.export.camera_paths import camera_path
-from gridreg.export.cameras import Camera
 from gridreg.export.mesh import write_mesh
-from gridreg.export.model import Model
 from gridreg.export.video import render_video
 from gridreg.export.viewer import Viewer
 from gridreg.export.writers import find_ffmpeg
+from gridreg.rendering.cameras import Camera
+from gridreg.rendering.model import Model
 from gridreg.scenes import Views
 
 if TYPE_CHECKING:
-    from gridreg.training import Execution, LoadedRun, StepReport, Trainer
+    from gridreg.training import Execution, StepReport, Trainer
 
 __all__ = [
     "LiveView",
@@ -28,20 +28,7 @@ __all__ = [
     "draw_run",
     "video_path",
     "live_view",
-    "model_of_run",
-    "model_of_trainer",
 ]
-
-
-def model_of_run(run: LoadedRun) -> Model:
-    """The model of a checkpoint that `gridreg.training.load_run` read."""
-    return Model(run.field, run.occupancy, run.march, run.background, run.handle, run.warp)
-
-
-def model_of_trainer(trainer: Trainer) -> Model:
-    """The model of a field in training; nothing is copied, so it follows the training."""
-    background = trainer.scene.background
-    return Model(trainer.field, trainer.occupancy, trainer.march, background, trainer.handle, trainer.warp)
 
 
 def video_path(
@@ -99,7 +86,7 @@ def draw_run(run: Execution, *, mesh: bool = True, video: bool = True) -> list[P
         InputError: without ffmpeg, or if the place is not writable.
     """
     trainer, written = run.trainer, []
-    model = model_of_trainer(trainer)
+    model = trainer.model
     forward = model.warp is not None
     if mesh and forward:
         print("no mesh: the field of a forward-facing scene is not in world coordinates", file=sys.stderr)
@@ -137,7 +124,7 @@ class LiveView:
     def start(self, run: Execution) -> None:
         """Open the page on the untrained field."""
         self._trainer = run.trainer
-        self.viewer = Viewer(model_of_trainer(run.trainer), run.scene.train, host=self._host, port=self._port)
+        self.viewer = Viewer(run.trainer.model, run.scene.train, host=self._host, port=self._port)
 
     def step(self, report: StepReport) -> None:
         """Show the field as it is now, if somebody looks and the last copy is old."""
@@ -158,7 +145,7 @@ class LiveView:
 
     def _update(self) -> None:
         if self.viewer is not None and self._trainer is not None:
-            self.viewer.update(model_of_trainer(self._trainer))
+            self.viewer.update(self._trainer.model)
 
 
 @contextmanager

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from gridreg.errors import InputError
-from gridreg.export.cameras import Camera
 from gridreg.export.images import DepthRange, check_mode, colour_bar, depth_range, to_image
-from gridreg.export.model import Model
 from gridreg.export.writers import check_target, write_video
 from gridreg.rendering import Rendered
+from gridreg.rendering.cameras import Camera
+from gridreg.rendering.model import Model
 from gridreg.training.images import ImageArray, row
 
 __all__ = ["Progress", "render_frames", "render_video"]

@@ -15,13 +15,14 @@ from torch import Tensor
 
 from gridreg.export._admission import Admission
 from gridreg.export.browser import add_frustums, camera_of, image_shape, quiet_console, start_server
-from gridreg.export.cameras import Camera, orbit_of_box, orbit_of_views
+from gridreg.export.cameras import orbit_of_box, orbit_of_views
 from gridreg.export.images import colour_bar, depth_range, to_image, z_depth
-from gridreg.export.model import Model
 from gridreg.export.pace import Pace
 from gridreg.export.preview import Preview
 from gridreg.export.viewer_panel import Look, Panel
 from gridreg.rendering import Rendered
+from gridreg.rendering.cameras import Camera
+from gridreg.rendering.model import Model
 from gridreg.scenes import Views
 from gridreg.training.images import ImageArray
 

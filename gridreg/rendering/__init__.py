@@ -1,7 +1,9 @@
 """Rays in, pixels out: box intersection, occupancy, march and compositing."""
 
 from gridreg.ops import RayMarchResult, chosen_backend, use_backend
+from gridreg.rendering.cameras import Camera, Lens
 from gridreg.rendering.ensemble import Ensemble
+from gridreg.rendering.model import Model
 from gridreg.rendering.occupancy import OccupancyGrid, visual_hull
 from gridreg.rendering.rays import Rays, box_intersection, camera_rays, pixel_rays
 from gridreg.rendering.render import (
@@ -10,14 +12,16 @@ from gridreg.rendering.render import (
     Rendered,
     SampleHook,
     composite,
-    render_image,
     render_rays,
 )
 
 __all__ = [
+    "Camera",
     "Ensemble",
     "Field",
+    "Lens",
     "MarchSettings",
+    "Model",
     "RayMarchResult",
     "OccupancyGrid",
     "Rays",
@@ -28,7 +32,6 @@ __all__ = [
     "chosen_backend",
     "composite",
     "pixel_rays",
-    "render_image",
     "render_rays",
     "use_backend",
     "visual_hull",

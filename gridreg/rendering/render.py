@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
@@ -11,7 +10,7 @@ from torch import Tensor
 
 from gridreg import ops
 from gridreg.rendering.occupancy import OccupancyGrid
-from gridreg.rendering.rays import Rays, box_intersection, camera_rays
+from gridreg.rendering.rays import Rays, box_intersection
 from gridreg.samples import RaySamples
 
 __all__ = [
@@ -19,7 +18,6 @@ __all__ = [
     "MarchSettings",
     "Rendered",
     "SampleHook",
-    "render_image",
     "render_rays",
 ]
 
@@ -119,7 +117,7 @@ def _march(
 def _colours(
     field: Any, marched: ops.RayMarchResult, chosen: Tensor, rays: Rays, ray_indices: Tensor
 ) -> Tensor:
-    """Colours of some of the samples; without gradients in blocks, which bounds the memory of a picture's fog."""
+    """Colours of some of the samples; without gradients in blocks, which bounds the memory of an image's fog."""
     if not torch.is_grad_enabled() and len(chosen) > _BLOCK:
         parts = zip(torch.split(chosen, _BLOCK), torch.split(ray_indices, _BLOCK), strict=True)
         return torch.cat([_colours(field, marched, some, rays, of) for some, of in parts])
@@ -147,6 +145,8 @@ def render_rays(
     near_far: tuple[Tensor, Tensor] | None = None,
     hook: SampleHook | None = None,
     generator: torch.Generator | None = None,
+    target_opacity: Tensor | None = None,
+    patch: tuple[int, int, int] | None = None,
 ) -> Rendered:
     """Render a batch of rays, differentiably in the field's parameters.
 
@@ -161,6 +161,7 @@ def render_rays(
         hook: gets the samples before they are composited.
         generator: for training: draws the representatives of merged samples (the march's ``merge_weight``); None: the
             samples at half of their weight.
+        target_opacity, patch: of the rays, for the samples, see `gridreg.RaySamples`.
     """
     if jitter is None:
         jitter = torch.full((len(rays),), 0.5, dtype=rays.origins.dtype, device=rays.origins.device)
@@ -171,24 +172,27 @@ def render_rays(
     if delta is None:
         delta = torch.full_like(marched.t, march.step)
         ray_steps = ((t_max - t_min) / march.step - jitter).ceil().clamp(min=0).long()
+    weights = ops.composite_weights(marched.density * delta, marched.offsets)
+    coloured, of_rays, groups = ops.merge_samples(
+        weights.detach(), marched.offsets, march.weight_bound, march.merge_weight, generator
+    )
+    found = _colours(field, marched, coloured, rays, of_rays)
     samples = RaySamples(
         offsets=marched.offsets,
         t=marched.t,
         delta=delta,
         index=marched.index,
         density=marched.density,
-        weights=ops.composite_weights(marched.density * delta, marched.offsets),
+        weights=weights,
         positions=marched.positions,
         directions=rays.directions,
         ray_start=t_min,
         ray_steps=ray_steps,
+        colours=ops.spread_to_samples(found, groups, coloured),
+        background=background.expand(len(rays), 3),
+        target_opacity=target_opacity,
+        patch=patch,
     )
-    coloured, of_rays, groups = ops.merge_samples(
-        samples.weights.detach(), samples.offsets, march.weight_bound, march.merge_weight, generator
-    )
-    found = _colours(field, marched, coloured, rays, of_rays)
-    colours = ops.spread_to_samples(found, groups, coloured)
-    samples = samples.replace(colours=colours, background=background.expand(len(rays), 3))
     if hook is not None:
         samples = hook.on_samples(samples)
     return replace(composite(samples), coloured=coloured)
@@ -202,37 +206,3 @@ def composite(samples: RaySamples) -> Rendered:
         samples.weights, samples.colours, samples.t, samples.background, samples.offsets
     )
     return Rendered(colour, opacity, depth, samples)
-
-
-@torch.no_grad()
-def render_image(
-    field: Any,
-    pose: Tensor,
-    intrinsics: Tensor,
-    height: int,
-    width: int,
-    occupancy: OccupancyGrid,
-    march: MarchSettings,
-    *,
-    background: Tensor,
-    chunk: int = 1 << 13,
-    warp: Callable[[Rays], Rays] | None = None,
-) -> Rendered:
-    """Render one picture; the result does not depend on ``chunk``.
-
-    ``warp`` maps the camera's rays to the field's coordinates where these are not the world's (forward-facing scenes).
-
-    Returns:
-        colour ``(H, W, 3)`` clamped to [0, 1], opacity and depth ``(H, W)``.
-    """
-    rays = camera_rays(pose, intrinsics, height, width)
-    rays = rays if warp is None else warp(rays)
-    parts = [
-        render_rays(field, rays[start : start + chunk], occupancy, march, background=background)
-        for start in range(0, len(rays), chunk)
-    ]
-    return Rendered(
-        torch.cat([p.colour for p in parts]).clamp(0, 1).reshape(height, width, 3),
-        torch.cat([p.opacity for p in parts]).reshape(height, width),
-        torch.cat([p.depth for p in parts]).reshape(height, width),
-    )

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from gridreg.rendering import MarchSettings, OccupancyGrid, Rays, Rendered, render_image
+from gridreg.rendering import Camera, Lens, Model, Rendered
 from gridreg.scenes import Views
 from gridreg.training.metrics import image_metrics, psnr
 
 __all__ = ["Scored", "mean_psnr_of", "render_views", "score_views"]
+
+Metrics = Callable[[Tensor, Tensor], dict[str, float]]
 
 
 @dataclass(frozen=True)
@@ -33,62 +34,36 @@ class Scored:
     metrics: dict[str, float]
 
 
-def render_views(
-    field: Any,
-    views: Views,
-    occupancy: OccupancyGrid,
-    march: MarchSettings,
-    background: Tensor,
-    *,
-    warp: Callable[[Rays], Rays] | None = None,
-) -> Iterator[Rendered]:
+def render_views(model: Model, views: Views) -> Iterator[Rendered]:
     """Images of a field from the cameras of views, one after the other."""
     for pose, intrinsics in zip(views.poses, views.intrinsics, strict=True):
-        yield render_image(
-            field,
-            pose,
-            intrinsics,
-            views.height,
-            views.width,
-            occupancy,
-            march,
-            background=background,
-            warp=warp,
-        )
+        rendered = model.render(Camera(pose, Lens.from_tensor(intrinsics, views.height, views.width)))
+        assert rendered is not None
+        yield rendered
 
 
 def score_views(
-    field: Any,
-    views: Views,
-    occupancy: OccupancyGrid,
-    march: MarchSettings,
-    background: Tensor,
-    each: Callable[[Scored], None] | None = None,
-    *,
-    warp: Callable[[Rays], Rays] | None = None,
+    model: Model, views: Views, each: Callable[[Scored], None] | None = None, metrics: Metrics = image_metrics
 ) -> list[Scored]:
-    """Render and score every view; ``each`` is told as soon as one is done."""
+    """Render and score every view.
+
+    Args:
+        model: the field, in eval mode.
+        views: with their targets, composited on the model's background.
+        each: is told as soon as one is done.
+        metrics: image and target ``(H, W, 3)`` to figures by name.
+    """
     scored = []
-    targets = views.composited(background)
-    images = render_views(field, views, occupancy, march, background, warp=warp)
-    for name, rendered, target in zip(views.names, images, targets, strict=True):
-        one = Scored(name, rendered, target, image_metrics(rendered.colour, target))
+    targets = views.composited(model.background)
+    for name, rendered, target in zip(views.names, render_views(model, views), targets, strict=True):
+        one = Scored(name, rendered, target, metrics(rendered.colour, target))
         scored.append(one)
         if each is not None:
             each(one)
     return scored
 
 
-def mean_psnr_of(
-    field: Any,
-    views: Views,
-    occupancy: OccupancyGrid,
-    march: MarchSettings,
-    background: Tensor,
-    stride: int = 1,
-    *,
-    warp: Callable[[Rays], Rays] | None = None,
-) -> float:
+def mean_psnr_of(model: Model, views: Views, stride: int = 1) -> float:
     """Mean PSNR (dB) over every ``stride``-th view, for a look on the way."""
     chosen = slice(None, None, stride)
     some = Views(
@@ -98,7 +73,8 @@ def mean_psnr_of(
         views.names[chosen],
         views.ids[chosen],
     )
-    targets = some.composited(background)
-    images = render_views(field, some, occupancy, march, background, warp=warp)
-    values = [psnr(p.colour, t) for p, t in zip(images, targets, strict=True)]
+    values = [
+        psnr(image.colour, target)
+        for image, target in zip(render_views(model, some), some.composited(model.background), strict=True)
+    ]
     return float(torch.tensor(values, dtype=torch.float64).mean())

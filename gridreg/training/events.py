@@ -1,34 +1,138 @@
-"""What happens to the grids between iterations: resampling, occupancy, shrinking, carving, ray filtering."""
+"""The space that a field in training fills, and the events that change it between iterations."""
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from typing import Any
 
 import torch
 
 from gridreg.errors import InputError
 from gridreg.rendering import MarchSettings, OccupancyGrid, visual_hull
-from gridreg.training.rays import meets
+from gridreg.scenes import Scene
+from gridreg.training.rays import RayBank, meets
+from gridreg.training.settings import TrainSettings
 
-if TYPE_CHECKING:
-    from gridreg.scenes import Scene
-    from gridreg.training.settings import TrainSettings
-    from gridreg.training.trainer import Trainer
+__all__ = ["OccupiedSpace", "carved_box", "cell_size", "march_of", "occupancy_resolution", "resolution_of"]
 
-__all__ = [
-    "carve",
-    "carved_box",
-    "cell_size",
-    "filter_rays",
-    "march_of",
-    "occupancy_resolution",
-    "resample",
-    "resolution_of",
-    "run",
-    "shrink",
-    "update_occupancy",
-]
+
+class OccupiedSpace:
+    """Box, occupied cells and visual hull of a field in training, and the schedule's events that change them.
+
+    It knows nothing of the optimizer: `run` says whether it replaced the field's parameters.
+
+    Args:
+        field: ``resample(resolution)`` and ``shrink(bounds)`` are called if it has them; a field without a grid, such
+            as a coordinate network, has nothing to crop or to refine.
+        scene: training views, near and far.
+        settings: when what is due.
+        bank: of training rays, from which those that meet nothing are dropped.
+        suspended: `gridreg.Handle.suspended` of what is attached to the field; parameters are replaced inside it.
+
+    Raises:
+        InputError: if the silhouettes leave no cell of the box.
+    """
+
+    def __init__(
+        self,
+        field: Any,
+        scene: Scene,
+        settings: TrainSettings,
+        bank: RayBank,
+        suspended: Callable[[], AbstractContextManager[Any]],
+    ) -> None:
+        self._field, self._scene, self._settings = field, scene, settings
+        self._bank, self._suspended = bank, suspended
+        self.occupancy = OccupancyGrid.full(field.bounds, occupancy_resolution(field, settings))
+        if self.carves:
+            hull = self._hull(self.occupancy)
+            self.occupancy = OccupancyGrid(self.occupancy.bounds, hull, hull)
+            self._require_occupied(0, "the silhouettes of the training views leave no cell")
+        if 0 in settings.filter_rays_at:
+            self.filter_rays()
+
+    @property
+    def carves(self) -> bool:
+        """Whether the visual hull counts; cells of normalised device coordinates have no silhouettes."""
+        return self._settings.carve and not self._scene.ndc
+
+    @property
+    def march(self) -> MarchSettings:
+        """Settings of the march at the field's present resolution."""
+        return march_of(self._field, self._settings, self._scene.near, self._scene.far)
+
+    def run(self, step: int) -> bool:
+        """Carry out the events that are due after ``step`` iterations; True if parameters were replaced.
+
+        Raises:
+            InputError: if no cell is left, which is a training that has died.
+        """
+        settings, replaced = self._settings, False
+        if step >= settings.steps:
+            return replaced
+        started = bool(settings.occupancy_at) and step > min(settings.occupancy_at)
+        regular = settings.occupancy_every and started and step % settings.occupancy_every == 0
+        if step in settings.occupancy_at or regular:
+            self.update(step)
+        if step in settings.shrink_at and hasattr(self._field, "shrink"):
+            self.shrink()
+            replaced = True
+        if step in settings.filter_rays_at:
+            self.filter_rays()
+        if step in settings.resample_at and hasattr(self._field, "resample"):
+            self.resample(step)
+            replaced = True
+        return replaced
+
+    def update(self, step: int) -> None:
+        """Find the empty cells.
+
+        Raises:
+            InputError: if no cell is left.
+        """
+        threshold = self._settings.occupancy_threshold
+        self.occupancy.update(self._field.density, self.march.step, threshold=threshold)
+        self._require_occupied(step, "the density has vanished everywhere")
+
+    def shrink(self) -> None:
+        """Crop the field to the occupied cells."""
+        with self._suspended():
+            self._field.shrink(self.occupancy.tight_bounds())
+        self._follow_field()
+
+    def resample(self, step: int) -> None:
+        """Give the field the resolution that the schedule has after ``step`` iterations (TensoRF's
+        ``upsample_volume_grid``)."""
+        done = sum(s <= step for s in self._settings.resample_at)
+        with self._suspended():
+            self._field.resample(resolution_of(self._settings.voxels_at(done), self._field.bounds))
+        self._follow_field()
+
+    def filter_rays(self) -> None:
+        """Draw only rays that meet an occupied cell, or whose pixel is not transparent."""
+        near, far = self._scene.near, self._scene.far
+        self._bank.restrict(lambda rays: meets(rays, self.occupancy, near, far))
+
+    def _follow_field(self) -> None:
+        """The same cells in the field's new box, at its new resolution."""
+        bounds, resolution = self._field.bounds, occupancy_resolution(self._field, self._settings)
+        self.occupancy = self.occupancy.at(bounds, resolution)
+        if self.carves:
+            hull = self._hull(OccupancyGrid.full(bounds, resolution))
+            self.occupancy = OccupancyGrid(self.occupancy.bounds, self.occupancy.cells * hull, hull)
+
+    def _hull(self, grid: OccupancyGrid) -> torch.Tensor:
+        views = self._scene.train
+        return visual_hull(grid, views.rgba[..., 3], views.poses, views.intrinsics)
+
+    def _require_occupied(self, step: int, why: str) -> None:
+        if not bool(self.occupancy.cells.any()):
+            raise InputError(
+                f"step {step}: the occupancy grid is empty ({why}); expected something inside the box "
+                f"{self._field.bounds.tolist()}: check the box, or start from a higher initial opacity"
+            )
 
 
 def cell_size(field: Any) -> float:
@@ -39,7 +143,7 @@ def cell_size(field: Any) -> float:
 
 
 def march_of(field: Any, settings: TrainSettings, near: float, far: float) -> MarchSettings:
-    """How rays are walked at a field's present resolution, between two distances, world units."""
+    """Settings of the march through a field of this resolution, between two distances, world units."""
     return MarchSettings(
         step=settings.step_ratio * cell_size(field),
         near=near,
@@ -74,42 +178,6 @@ def carved_box(scene: Scene, resolution: int = 128) -> torch.Tensor:
     return OccupancyGrid(grid.bounds, hull).tight_bounds()
 
 
-def carve(trainer: Trainer) -> None:
-    """Start from the cells that no training view's alpha proves empty."""
-    views, grid = trainer.scene.train, trainer.occupancy
-    hull = visual_hull(grid, views.rgba[..., 3], views.poses, views.intrinsics)
-    trainer.occupancy = OccupancyGrid(grid.bounds, hull, hull)
-    _require_occupied(trainer, "the silhouettes of the training views leave no cell")
-
-
-def shrink(trainer: Trainer) -> None:
-    """Crop the field to the occupied cells."""
-    field = trainer.field
-    with trainer.handle.suspended():
-        field.shrink(trainer.occupancy.tight_bounds())
-    _rebuild(trainer)
-
-
-def resample(trainer: Trainer) -> None:
-    """Give the field the schedule's next resolution."""
-    settings, field = trainer.settings, trainer.field
-    done = sum(s <= trainer.step for s in settings.resample_at)
-    with trainer.handle.suspended():
-        field.resample(resolution_of(settings.voxels_at(done), field.bounds))
-    _rebuild(trainer)
-
-
-def _rebuild(trainer: Trainer) -> None:
-    resolution = occupancy_resolution(trainer.field, trainer.settings)
-    trainer.occupancy = trainer.occupancy.at(trainer.field.bounds, resolution)
-    if trainer.carves:
-        hull = OccupancyGrid.full(trainer.field.bounds, resolution)
-        views = trainer.scene.train
-        hull.cells = visual_hull(hull, views.rgba[..., 3], views.poses, views.intrinsics)
-        trainer.occupancy = OccupancyGrid(hull.bounds, trainer.occupancy.cells * hull.cells, hull.cells)
-    trainer.restart_optimizer()
-
-
 def resolution_of(voxels: float, bounds: torch.Tensor) -> tuple[int, int, int]:
     """Nodes along x, y, z of a grid with cubic cells and about ``voxels`` of them (TensoRF ``N_to_reso``).
 
@@ -121,47 +189,3 @@ def resolution_of(voxels: float, bounds: torch.Tensor) -> tuple[int, int, int]:
     edge = float((size.prod() / voxels) ** (1 / 3))
     x, y, z = (max(2, int(round(float(s) / edge, 6))) for s in size)
     return x, y, z
-
-
-def update_occupancy(trainer: Trainer) -> None:
-    """Find the empty cells.
-
-    Raises:
-        InputError: if no cell is left, which is a training that has died.
-    """
-    trainer.occupancy.update(
-        trainer.field.density, trainer.march.step, threshold=trainer.settings.occupancy_threshold
-    )
-    _require_occupied(trainer, "the density has vanished everywhere")
-
-
-def _require_occupied(trainer: Trainer, why: str) -> None:
-    if not bool(trainer.occupancy.cells.any()):
-        raise InputError(
-            f"step {trainer.step}: the occupancy grid is empty ({why}); expected something inside the box "
-            f"{trainer.field.bounds.tolist()}: check the box, or start from a higher initial opacity"
-        )
-
-
-def filter_rays(trainer: Trainer) -> None:
-    """Draw only rays that meet an occupied cell, or whose pixel is not transparent."""
-    near, far = trainer.scene.near, trainer.scene.far
-    trainer.bank.restrict(lambda rays: meets(rays, trainer.occupancy, near, far))
-
-
-def run(trainer: Trainer) -> None:
-    """The events that are due after iteration ``trainer.step``."""
-    step, settings = trainer.step, trainer.settings
-    if step >= settings.steps:
-        return
-    started = bool(settings.occupancy_at) and step > min(settings.occupancy_at)
-    regular = settings.occupancy_every and started and step % settings.occupancy_every == 0
-    if step in settings.occupancy_at or regular:
-        update_occupancy(trainer)
-    # A field without a grid, such as a coordinate network, has nothing to crop or to refine.
-    if step in settings.shrink_at and hasattr(trainer.field, "shrink"):
-        shrink(trainer)
-    if step in settings.filter_rays_at:
-        filter_rays(trainer)
-    if step in settings.resample_at and hasattr(trainer.field, "resample"):
-        resample(trainer)

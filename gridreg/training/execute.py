@@ -126,15 +126,7 @@ class Execution:
         trainer = self.trainer
         began = time.perf_counter()
         trainer.field.eval()
-        value = mean_psnr_of(
-            trainer.field,
-            views,
-            trainer.occupancy,
-            trainer.march,
-            self.scene.background,
-            stride,
-            warp=trainer.warp,
-        )
+        value = mean_psnr_of(trainer.model, views, stride)
         trainer.field.train()
         # What a look costs is not training time.
         self.seconds["look"] = self.seconds.get("look", 0.0) + time.perf_counter() - began
@@ -161,15 +153,7 @@ class Execution:
                 raise KeyboardInterrupt
 
         done: list[Scored] = []
-        scored = score_views(
-            trainer.field,
-            self.scene.test,
-            trainer.occupancy,
-            trainer.march,
-            self.scene.background,
-            each,
-            warp=trainer.warp,
-        )
+        scored = score_views(trainer.model, self.scene.test, each)
         trainer.field.train()
         self.seconds["test"] = time.perf_counter() - began
         return scored

@@ -7,16 +7,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import torch
-
 import gridreg
-from gridreg.attach.handle import Handle
 from gridreg.errors import InputError
 from gridreg.fields import make_field
-from gridreg.rendering import Ensemble, MarchSettings, OccupancyGrid
-from gridreg.training import events
+from gridreg.rendering import Ensemble, Model, OccupancyGrid
 from gridreg.training.checkpoint import has_checkpoint, load_checkpoint
 from gridreg.training.config import from_data
+from gridreg.training.events import march_of
 from gridreg.training.rays import NdcWarp
 from gridreg.training.run import regularizers_of
 from gridreg.training.settings import RunConfig
@@ -25,33 +22,23 @@ from gridreg.training.trainer import load_field
 __all__ = ["LoadedRun", "checkpoint_of", "ensemble_of", "load_run", "members_in"]
 
 
-@dataclass(frozen=True)
-class LoadedRun:
-    """A trained field and all it takes to render it.
+@dataclass(frozen=True, kw_only=True)
+class LoadedRun(Model):
+    """A trained field, in eval mode, with all it takes to render it, and the run that it comes from.
 
     Args:
-        field: in eval mode.
-        occupancy: cells that may hold something.
-        march: step and range of the rays.
-        background: ``(3,)`` colour behind the field.
-        config: of the run; of an ensemble, the first member's.
-        step: iterations done; of an ensemble, the fewest of its members'.
+        field, occupancy, march, background, warp: see `gridreg.rendering.Model`.
         handle: of the regularizers; masks that are not fully open act only as long as it is kept. None for an ensemble,
             whose members have theirs.
+        config: of the run; of an ensemble, the first member's.
+        step: iterations done; of an ensemble, the fewest of its members'.
         fingerprint: of the scene it was trained on, see `gridreg.scenes.Scene`.
-        warp: maps rays of cameras to the field's coordinates; None: these are the world's.
         members: the runs that an ensemble is made of, else none.
     """
 
-    field: Any
-    occupancy: OccupancyGrid
-    march: MarchSettings
-    background: torch.Tensor
     config: RunConfig
     step: int
-    handle: Handle | None
     fingerprint: str
-    warp: NdcWarp | None = None
     members: tuple[LoadedRun, ...] = ()
 
 
@@ -100,7 +87,7 @@ def load_run(folder: str | Path) -> LoadedRun:
 
 
 def ensemble_of(runs: Sequence[LoadedRun]) -> LoadedRun:
-    """Runs of one scene as one, see `gridreg.rendering.Ensemble`; rays are walked at the shortest step of any.
+    """Runs of one scene as one, see `gridreg.rendering.Ensemble`; the march has the shortest step of any.
 
     Args:
         runs: with equal fingerprint, background and warp.
@@ -133,17 +120,16 @@ def _run(plain: Any, state: dict[str, Any], fingerprint: str, source: str) -> Lo
     handle.load_state_dict(trainer["handle"])
     handle.step(min(int(trainer["step"]), config.train.steps))
     field.eval()
-    march = events.march_of(field, config.train, state["march"]["near"], state["march"]["far"])
     return LoadedRun(
-        field,
-        OccupancyGrid(**trainer["occupancy"]),
-        march,
-        state["background"],
-        config,
-        int(trainer["step"]),
-        handle,
-        fingerprint,
-        _saved_warp(state.get("warp")),
+        field=field,
+        occupancy=OccupancyGrid(**trainer["occupancy"]),
+        march=march_of(field, config.train, state["march"]["near"], state["march"]["far"]),
+        background=state["background"],
+        handle=handle,
+        warp=_saved_warp(state.get("warp")),
+        config=config,
+        step=int(trainer["step"]),
+        fingerprint=fingerprint,
     )
 
 

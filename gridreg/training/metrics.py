@@ -1,7 +1,7 @@
 """PSNR and SSIM, each in a named convention, so that two numbers are compared only if they mean the same.
 
 All metrics take images of shape ``(H, W, C)`` in [0, 1] (clamped to it first, as the published programs do)
-and are computed in float64 on the images' own device. SSIM comes in two conventions, which differ by some
+and are computed in float64. SSIM comes in two conventions, which differ by some
 hundredths:
 
 ``gaussian``
@@ -17,10 +17,10 @@ hundredths:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, get_args
 
-import torch
+from skimage.metrics import structural_similarity
 from torch import Tensor
 
 from gridreg.errors import InputError
@@ -31,29 +31,17 @@ __all__ = [
     "json_number",
     "json_ready",
     "mean_metrics",
-    "mean_psnr",
-    "mse_to_psnr",
     "psnr",
     "ssim",
 ]
 
 SsimConvention = Literal["gaussian", "uniform"]
 
-_K1, _K2 = 0.01, 0.03
-
-
-def mse_to_psnr(mse: float) -> float:
-    """PSNR in dB of a mean squared error of values in [0, 1]: ``-10 log10(mse)``, infinite for 0.
-
-    Example:
-        >>> mse_to_psnr(0.01)
-        20.0
-        >>> mse_to_psnr(0.0)
-        inf
-    """
-    if math.isnan(mse):
-        return math.nan
-    return math.inf if mse == 0 else -10.0 * math.log10(mse)
+# Keywords of scikit-image, and the smallest image that its window fits into, pixels.
+_SSIM: dict[str, tuple[dict[str, Any], int]] = {
+    "gaussian": ({"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}, 11),
+    "uniform": ({}, 7),
+}
 
 
 def psnr(image: Tensor, target: Tensor) -> float:
@@ -69,21 +57,8 @@ def psnr(image: Tensor, target: Tensor) -> float:
         19.99999...
     """
     a, b = _pair(image, target)
-    return mse_to_psnr(float((a - b).square().mean()))
-
-
-def mean_psnr(images: Iterable[Tensor], targets: Iterable[Tensor]) -> float:
-    """Mean over images of the PSNR of each, as papers report it (not the PSNR of the mean error).
-
-    Raises:
-        InputError: if there is no image, or the numbers of images or the shapes differ.
-    """
-    images, targets = list(images), list(targets)
-    if len(images) != len(targets) or not images:
-        raise InputError(
-            f"images, targets: {len(images)} and {len(targets)}; expected equally many, at least one"
-        )
-    return _mean([psnr(a, b) for a, b in zip(images, targets, strict=True)])
+    mse = float((a - b).square().mean())
+    return math.inf if mse == 0 else mse if math.isnan(mse) else -10.0 * math.log10(mse)
 
 
 def ssim(image: Tensor, target: Tensor, convention: SsimConvention = "gaussian") -> float:
@@ -106,26 +81,17 @@ def ssim(image: Tensor, target: Tensor, convention: SsimConvention = "gaussian")
         1.0
     """
     a, b = _pair(image, target)
-    if convention == "gaussian":
-        window = _gaussian_window(a)
-        correction = 1.0
-    elif convention == "uniform":
-        window = torch.full((7,), 1 / 7, dtype=a.dtype, device=a.device)
-        correction = 49 / 48
-    else:
+    if convention not in _SSIM:
         raise InputError(f"convention: {convention!r}; expected one of {', '.join(get_args(SsimConvention))}")
-    if min(a.shape[:2]) < len(window):
+    options, least = _SSIM[convention]
+    if min(a.shape[:2]) < least:
         raise InputError(
-            f"image: {a.shape[0]}x{a.shape[1]} pixels; {convention} SSIM needs {len(window)} or more each way"
+            f"image: {a.shape[0]}x{a.shape[1]} pixels; {convention} SSIM needs {least} or more each way"
         )
-    mean_a, mean_b, mean_aa, mean_bb, mean_ab = _filter(torch.stack([a, b, a * a, b * b, a * b]), window)
-    var_a = correction * (mean_aa - mean_a * mean_a)
-    var_b = correction * (mean_bb - mean_b * mean_b)
-    cov = correction * (mean_ab - mean_a * mean_b)
-    c1, c2 = _K1**2, _K2**2
-    luminance = (2 * mean_a * mean_b + c1) / (mean_a.square() + mean_b.square() + c1)
-    structure = (2 * cov + c2) / (var_a + var_b + c2)
-    return float((luminance * structure).mean())
+    found = structural_similarity(  # type: ignore[no-untyped-call]
+        a.numpy(), b.numpy(), data_range=1.0, channel_axis=-1, **options
+    )
+    return float(found)
 
 
 def image_metrics(
@@ -166,7 +132,8 @@ def mean_metrics(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
             raise InputError(
                 f"rows: {sorted(row)} beside {sorted(rows[0])}; expected the same metrics in all"
             )
-    return {name: _mean([row[name] for row in rows]) for name in rows[0]}
+    # math.fsum refuses inf - inf and is not needed: a mean with one infinity is infinite, with a NaN it is NaN.
+    return {name: sum(row[name] for row in rows) / len(rows) for name in rows[0]}
 
 
 def json_number(value: float) -> float | str:
@@ -202,34 +169,5 @@ def _pair(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
         )
     if image.ndim != 3 or image.numel() == 0:
         raise InputError(f"image: shape {tuple(image.shape)}; expected (H, W, C)")
-    # Apple's GPUs have no float64.
-    dtype = torch.float32 if image.device.type == "mps" else torch.float64
-    a = image.detach().to(dtype).clamp(0, 1)
-    return a, target.detach().to(a).clamp(0, 1)
-
-
-def _gaussian_window(like: Tensor) -> Tensor:
-    """Weights (11,) of sigma 1.5 that sum to 1."""
-    x = torch.arange(-5, 6, dtype=like.dtype, device=like.device)
-    window = torch.exp(-0.5 * (x / 1.5).square())
-    return window / window.sum()
-
-
-def _filter(stack: Tensor, window: Tensor) -> Tensor:
-    """Separable 'valid' convolution of ``(5, H, W, C)`` along H and W with a symmetric window ``(K,)``."""
-    weights: list[float] = window.tolist()
-    rows, columns = stack.shape[1] - len(weights) + 1, stack.shape[2] - len(weights) + 1
-    # Shifted sums: torch's convolutions have no fast float64 path on the CPU.
-    vertical = weights[0] * stack[:, :rows]
-    for offset, weight in enumerate(weights[1:], start=1):
-        vertical.add_(stack[:, offset : offset + rows], alpha=weight)
-    result = weights[0] * vertical[:, :, :columns]
-    for offset, weight in enumerate(weights[1:], start=1):
-        result.add_(vertical[:, :, offset : offset + columns], alpha=weight)
-    return result
-
-
-def _mean(values: Sequence[float]) -> float:
-    # math.fsum refuses inf - inf and is not needed: a mean with one infinity is infinite, with a NaN it is
-    # NaN.
-    return sum(values) / len(values)
+    a, b = (x.detach().cpu().double().clamp(0, 1) for x in (image, target))
+    return a, b

@@ -13,7 +13,24 @@ from gridreg.errors import InputError
 from gridreg.rendering import OccupancyGrid, Rays, box_intersection, pixel_rays
 from gridreg.scenes import Scene, Views, ndc_rays
 
-__all__ = ["NdcWarp", "RayBank", "meets", "warp_of"]
+__all__ = ["Batch", "NdcWarp", "RayBank", "meets", "warp_of"]
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Rays of one iteration.
+
+    Args:
+        rays: ``R`` of them.
+        rgba: ``(S, 4)`` pixels that the first ``S`` rays are compared with.
+        jitter: ``(R,)`` in [0, 1), the fraction of a step by which each ray's samples are shifted.
+        patch: ``(count, height, width)`` of the patches that the last rays form; None: there are none.
+    """
+
+    rays: Rays
+    rgba: Tensor
+    jitter: Tensor
+    patch: tuple[int, int, int] | None = None
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,9 @@ from gridreg.base import Regularizer
 from gridreg.errors import InputError
 from gridreg.fields import make_field
 from gridreg.scenes import Scene, builtin_scene, default_protocol, load_scene
-from gridreg.training import events
 from gridreg.training.checkpoint import load_checkpoint, save_checkpoint
 from gridreg.training.config import to_data
+from gridreg.training.events import carved_box, resolution_of
 from gridreg.training.settings import RunConfig
 from gridreg.training.trainer import Trainer
 
@@ -63,11 +63,11 @@ def regularizers_of(config: RunConfig) -> list[Regularizer]:
 def build_trainer(config: RunConfig, scene: Scene) -> Trainer:
     """Field and trainer of a configuration, at step 0."""
     settings = config.train
-    bounds = events.carved_box(scene) if settings.carve and not scene.ndc else scene.bounds
+    bounds = carved_box(scene) if settings.carve and not scene.ndc else scene.bounds
     field = make_field(
         config.backbone,
         bounds,
-        events.resolution_of(settings.voxels_start, bounds),
+        resolution_of(settings.voxels_start, bounds),
         generator=torch.Generator().manual_seed(config.seed),
         **config.field,
     )

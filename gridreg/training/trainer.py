@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -15,11 +14,11 @@ from torch import Tensor, nn
 import gridreg
 from gridreg.base import Regularizer
 from gridreg.errors import InputError
-from gridreg.rendering import MarchSettings, OccupancyGrid, Rays, Rendered, render_rays
+from gridreg.rendering import MarchSettings, Model, OccupancyGrid, Rays, Rendered, render_rays
 from gridreg.scenes import Scene
-from gridreg.training import events
 from gridreg.training.averaging import WeightAverage
-from gridreg.training.rays import RayBank, warp_of
+from gridreg.training.events import OccupiedSpace
+from gridreg.training.rays import Batch, RayBank, warp_of
 from gridreg.training.settings import TrainSettings
 from gridreg.training.unseen import UnseenPatches
 
@@ -63,7 +62,7 @@ class Trainer:
         if any("patch" in regularizer.needs() for regularizer in composition):
             self.unseen = UnseenPatches(scene.train, settings.patch_size, self.warp)
         self.step = 0
-        self.occupancy = OccupancyGrid.full(field.bounds, events.occupancy_resolution(field, settings))
+        self.space = OccupiedSpace(field, scene, settings, self.bank, self.handle.suspended)
         self._restart_at = 0
         self.average = WeightAverage()
         self.optimizer = self._make_optimizer()
@@ -71,20 +70,21 @@ class Trainer:
         self._gradient_context: Callable[[], AbstractContextManager[Any]] = (
             nullcontext if make is None else partial(make, rounding=settings.faint_gradient)
         )
-        if self.carves:
-            events.carve(self)
-        if 0 in settings.filter_rays_at:
-            events.filter_rays(self)
 
     @property
-    def carves(self) -> bool:
-        """Whether the visual hull counts; cells of normalised device coordinates have no silhouettes."""
-        return self.settings.carve and not self.scene.ndc
+    def occupancy(self) -> OccupancyGrid:
+        """Cells that may hold something."""
+        return self.space.occupancy
 
     @property
     def march(self) -> MarchSettings:
-        """How rays are walked at the field's present resolution."""
-        return events.march_of(self.field, self.settings, self.scene.near, self.scene.far)
+        """Settings of the march at the field's present resolution."""
+        return self.space.march
+
+    @property
+    def model(self) -> Model:
+        """The field with all it takes to render it; nothing is copied, so it follows the training."""
+        return Model(self.field, self.occupancy, self.march, self.scene.background, self.handle, self.warp)
 
     def _make_optimizer(self) -> torch.optim.Optimizer:
         rates = {"grid": self.settings.learning_rate_grid, "network": self.settings.learning_rate_network}
@@ -106,7 +106,7 @@ class Trainer:
         self.handle.update_groups(self.optimizer.param_groups)
 
     def restart_optimizer(self) -> None:
-        """A fresh optimizer for replaced parameters; the decay starts anew if the settings say so."""
+        """Make a fresh optimizer for replaced parameters; the decay starts anew if the settings say so."""
         if self.settings.reset_learning_rate:
             self._restart_at = self.step
         self.average.clear()
@@ -121,46 +121,49 @@ class Trainer:
             if self.step == settings.steps:
                 self.average.copy_to(self.field.parameters())
 
-    def render_batch(self) -> tuple[Rendered, Tensor]:
-        """Draw rays, render them, and composite the targets of the first ones on the same background ``(R, 3)``.
-
-        Rays of unseen patches, where a regularizer needs them, come last and have no targets. The samples know the
-        opacity of their targets, but for these and for opaque photographs on a backdrop, which tell nothing of it.
-        """
+    def draw_batch(self) -> Batch:
+        """Draw random training rays and, where a regularizer needs them, rays of unseen patches behind these."""
         settings = self.settings
         rays, rgba = self.bank.draw(settings.rays, self.generator)
-        seen, patch = len(rays), None
+        patch = None
         if self.unseen is not None:
             more = self.unseen.draw(settings.patches, self.generator)
             rays = Rays(
                 torch.cat([rays.origins, more.origins]), torch.cat([rays.directions, more.directions])
             )
             patch = (settings.patches, settings.patch_size, settings.patch_size)
-        jitter = torch.rand(len(rays), generator=self.generator)
-        default = self.scene.background.to(rgba)
-        background, opacity = None, rgba.new_full((len(rays),), math.nan)
+        return Batch(rays, rgba, torch.rand(len(rays), generator=self.generator), patch)
+
+    def _background(self, batch: Batch) -> tuple[Tensor, Tensor]:
+        """The colour behind each ray ``(R, 3)``, and the opacity of its target ``(R,)``, NaN where nothing tells it."""
+        count, default = len(batch.rays), self.scene.background.to(batch.rgba)
+        background, opacity = None, batch.rgba.new_full((count,), math.nan)
         # Behind opaque photographs on one colour, random ones would be answered with walls of that colour.
         if self.scene.train.backdrop is None:
-            background = self.handle.background(len(rays), self.generator, default)
-            opacity[:seen] = rgba[:, 3]
-        background = (default if background is None else background).expand(len(rays), 3)
-        target = rgba[:, :3] * rgba[:, 3:] + (1 - rgba[:, 3:]) * background[:seen]
-        march = self.march
-        ones = torch.ones_like(jitter)
+            background = self.handle.background(count, self.generator, default)
+            opacity[: len(batch.rgba)] = batch.rgba[:, 3]
+        return (default if background is None else background).expand(count, 3), opacity
+
+    def render_batch(self) -> tuple[Rendered, Tensor]:
+        """Draw rays, render them, and composite the targets of the first ones on the same background ``(S, 3)``."""
+        batch, march = self.draw_batch(), self.march
+        background, opacity = self._background(batch)
+        ones = torch.ones_like(batch.jitter)
         rendered = render_rays(
             self.field,
-            rays,
+            batch.rays,
             self.occupancy,
             march,
             background=background,
-            jitter=jitter,
+            jitter=batch.jitter,
             near_far=self.handle.near_far(march.near * ones, march.far * ones),
             hook=self.handle,
             generator=self.generator,
+            target_opacity=opacity,
+            patch=batch.patch,
         )
-        assert rendered.samples is not None
-        samples = rendered.samples.replace(target_opacity=opacity, patch=patch)
-        return replace(rendered, samples=samples), target
+        rgb, alpha = batch.rgba[:, :3], batch.rgba[:, 3:]
+        return rendered, rgb * alpha + (1 - alpha) * background[: len(rgb)]
 
     def train_step(self) -> StepReport:
         """One iteration.
@@ -192,7 +195,8 @@ class Trainer:
         else:
             self.optimizer.step()
         self.step += 1
-        events.run(self)
+        if self.space.run(self.step):
+            self.restart_optimizer()
         self._average()
         return report
 
@@ -234,17 +238,14 @@ class Trainer:
         self.generator.set_state(state["generator"])
         if "average" in state:
             self.average.load_state_dict(state["average"])
-        self.occupancy = OccupancyGrid(**state["occupancy"])
+        self.space.occupancy = OccupancyGrid(**state["occupancy"])
         self.bank.active = state["active"]
         self.bank.waiting = state.get("waiting", self.bank.active[:0])
 
 
-def load_field(field: nn.Module, state: dict[str, Any], handle: Any = None) -> None:
-    """Bring a field to the grid sizes and values of a checkpoint's state."""
+def load_field(field: nn.Module, state: dict[str, Any], handle: gridreg.Handle | None = None) -> None:
+    """Bring a field to the grid sizes and values of a checkpoint's state, past what ``handle`` has attached to it."""
     if state["resolution"]:
-        if handle is None:
+        with nullcontext() if handle is None else handle.suspended():
             field.resample(tuple(state["resolution"]))  # type: ignore[operator]
-        else:
-            with handle.suspended():
-                field.resample(tuple(state["resolution"]))  # type: ignore[operator]
     field.load_state_dict(state["field"])

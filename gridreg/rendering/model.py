@@ -1,4 +1,4 @@
-"""A field with all it takes to see it."""
+"""A field with all it takes to render it."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gridreg import Handle
+from gridreg.attach.handle import Handle
 from gridreg.errors import InputError
-from gridreg.export.cameras import Camera
-from gridreg.rendering import MarchSettings, OccupancyGrid, Rays, Rendered, camera_rays, render_rays
+from gridreg.rendering.cameras import Camera
+from gridreg.rendering.occupancy import OccupancyGrid
+from gridreg.rendering.rays import Rays, camera_rays
+from gridreg.rendering.render import MarchSettings, Rendered, render_rays
 
 __all__ = ["Model"]
 
@@ -23,7 +25,7 @@ def _white() -> Tensor:
 
 @dataclass(frozen=True)
 class Model:
-    """What is to be looked at.
+    """A field with its occupied cells, the march through it, and what lies behind it.
 
     Args:
         field: a `gridreg.rendering.Field`.
@@ -61,7 +63,7 @@ class Model:
 
     @torch.no_grad()
     def render(
-        self, camera: Camera, *, chunk: int = 1 << 14, stop: Callable[[], bool] | None = None
+        self, camera: Camera, *, chunk: int = 1 << 13, stop: Callable[[], bool] | None = None
     ) -> Rendered | None:
         """An image; the result does not depend on ``chunk``.
 
