@@ -63,7 +63,7 @@ def reconstruct(subject: Path, protocol: str, arguments: argparse.Namespace) -> 
         set=tuple(arguments.set),
     )
     config = configure(options)
-    scene = open_scene(config, cache=Path(tempfile.gettempdir()))
+    scene = open_scene(config, cache=stored.SCENES)
     with tempfile.TemporaryDirectory() as out:
         run, metrics = execute(config, scene, out)
         if metrics is None:

@@ -24,6 +24,7 @@ import stored
 import torch
 from numpy.typing import NDArray
 from PIL import ExifTags, Image
+from trimesh.registration import procrustes
 
 from gridreg.cli import run_cli
 from gridreg.scenes import load_scene, prepare
@@ -37,7 +38,7 @@ Array = NDArray[np.float64]
 
 
 def poses_around(count: int) -> list[Array]:
-    """Cameras as a person walks around twice: rings at 20 and 42 degrees, the second between those of the first."""
+    """Return cameras of a walk around, twice: rings at 20 and 42 degrees, the second between those of the first."""
     rings = ((20.0, count - count // 2), (42.0, count // 2))
     return [
         look_at_origin(360.0 * (k + 0.5 * ring) / number, elevation)
@@ -65,17 +66,14 @@ def take_photographs(folder: Path, poses: list[Array], size: int) -> float:
 
 
 def similarity(source: Array, target: Array) -> tuple[float, Array, Array]:
-    """Scale, rotation ``(3, 3)`` and shift ``(3,)`` that take points ``(N, 3)`` closest to others (Umeyama 1991)."""
-    a, b = source.mean(axis=0), target.mean(axis=0)
-    u, s, v = np.linalg.svd((target - b).T @ (source - a) / len(source))
-    sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ v))])
-    rotation = u @ sign @ v
-    scale = float(np.trace(np.diag(s) @ sign) / ((source - a) ** 2).sum(axis=1).mean())
-    return scale, rotation, b - scale * rotation @ a
+    """Return scale, rotation ``(3, 3)`` and shift ``(3,)`` that take points ``(N, 3)`` closest to others."""
+    matrix = procrustes(source, target, reflection=False, return_cost=False)
+    scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+    return scale, matrix[:3, :3] / scale, matrix[:3, 3]
 
 
 def robust_similarity(source: Array, target: Array, rounds: int = 6) -> tuple[float, Array, Array]:
-    """`similarity` of the points that agree: each round leaves out those further off than 3 times the median."""
+    """Return the `similarity` of points that agree: a round leaves out those further off than 3 times the median."""
     kept = np.ones(len(source), dtype=bool)
     for _ in range(rounds):
         scale, rotation, shift = similarity(source[kept], target[kept])
@@ -85,7 +83,7 @@ def robust_similarity(source: Array, target: Array, rounds: int = 6) -> tuple[fl
 
 
 def with_true_cameras(scene: Path, out: Path, truth: dict[str, Array], focal: float) -> dict[str, float]:
-    """A copy of a prepared scene with the true cameras in its world, and how far off the estimated ones were."""
+    """Write a copy of a prepared scene with the true cameras in its world; return the errors of the estimated ones."""
     content = json.loads((scene / "transforms.json").read_text())
     names = [Path(frame["file_path"]).stem for frame in content["frames"]]
     estimated = np.array([frame["transform_matrix"] for frame in content["frames"]])

@@ -77,7 +77,7 @@ def score(folder: Path, run: str, seed: int, arguments: argparse.Namespace) -> N
         set=changes,
     )
     config = configure(options)
-    scene = open_scene(config, cache=Path(tempfile.gettempdir()))
+    scene = open_scene(config, cache=stored.SCENES)
     spans = Trained(config.train)
     use_backend(arguments.backend)
     with ExitStack() as stack:

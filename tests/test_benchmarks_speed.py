@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from argparse import Namespace
 from collections.abc import Callable, Iterator
@@ -16,8 +15,7 @@ from gridreg.ops.cpu import composite
 from gridreg.scenes import builtin_scene
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
-import overhead
-from timing import common, main, whole_run
+from timing import common, main, masks, whole_run
 from timing.ball import ball_step
 
 from tests.speed_runs import SMALL, TINY, one_thread, run
@@ -85,7 +83,7 @@ def test_masks_do_not_change_the_samples(
     words = ["masks", "--backbone", backbone, "--rays", "32", "--edge", "10", "--repeats", "2"]
     record, printed = run([*words, "--shares", "0.25", "1"], tmp_path / "r", capsys)
     rows = record["rows"]
-    assert list(rows) == ["no masks", "no masks again", "0.25", "1"]
+    assert list(rows) == ["no masks", "no masks again", "opened", "half-way", "0.25", "1"]
     assert rows["0.25"]["colour_samples_per_ray"] == pytest.approx(
         rows["no masks"]["colour_samples_per_ray"], rel=0.05
     )
@@ -243,17 +241,10 @@ def test_the_ball_is_opaque_and_not_fog() -> None:
     assert float(opacity.median()) > 0.99
 
 
-def test_overhead_of_an_open_composition(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["--rays", "32", "--edge", "10", "--repeats", "2", "--threads", "1"]
-    assert overhead.main([*words, "--results", str(tmp_path)]) == 0
-    (stored,) = map(json.loads, (tmp_path / "overhead.jsonl").read_text().splitlines())
-    assert stored["name"] == "vm-10-1threads"
-    assert set(stored["ratios"]) == {"bare again", "masks open", "masks half-way"}
-    assert stored["colour_samples_per_ray"] > 1
-    assert "masks open / bare" in capsys.readouterr().out
-
-
 def test_fully_open_masks_leave_the_step_as_it_is() -> None:
-    bare, opened = (overhead.make_step("vm", 10, 32, at) for at in (None, 1.0))
+    opened = masks.opening_step("vm", 10, 32, masks.COMPONENTS + masks.ENCODINGS, 1.0)
     opened.handle.step(opened.at)
-    assert torch.equal(bare.render().colour, opened.render().colour)
+    assert torch.equal(ball_step("vm", 10, 32).render().colour, opened.render().colour)
+    half = masks.opening_step("vm", 10, 32, masks.COMPONENTS + masks.ENCODINGS, 0.25)
+    half.handle.step(half.at)
+    assert not torch.equal(half.render().colour, opened.render().colour)

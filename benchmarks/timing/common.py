@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import hashlib
 import statistics
-import tempfile
 import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -68,7 +67,7 @@ def configuration(arguments: argparse.Namespace, steps: int | None = None) -> Ru
 
 def scene_of(config: RunConfig, *, test: Sequence[int] | None = None) -> Scene:
     """The scene of a configuration; the built-in one is drawn once for all benchmarks."""
-    return open_scene(config, cache=Path(tempfile.gettempdir()), test=test)
+    return open_scene(config, cache=stored.SCENES, test=test)
 
 
 def in_turns(
