@@ -14,7 +14,7 @@ from gridreg import ops
 from gridreg.attach._hooks import open_channels
 from gridreg.attach.sites import Site, inputs, parameters
 from gridreg.encodings import octaves_of_channels
-from gridreg.ops.linear import Precision
+from gridreg.ops.perceptron import Precision
 
 __all__ = ["DECODERS", "Basis", "MLPDecoder", "RGBDecoder", "SHDecoder", "make_decoder"]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -13,9 +13,9 @@ from backbones.hierarchical import intervals, inverse_transform, stratified
 from backbones.tensorial import density_shift_for
 from gridreg import ops
 from gridreg.attach.sites import Site, parameters
-from gridreg.encodings import octaves_of_channels
+from gridreg.encodings import octaves_of_channels, positional_encoding
 from gridreg.ops.fused_adam import FusedAdam
-from gridreg.ops.linear import Precision
+from gridreg.ops.perceptron import Precision
 from gridreg.rendering import OccupancyGrid, RayMarchResult, Rays
 
 __all__ = ["MLPField"]
@@ -126,11 +126,11 @@ class MLPField(nn.Module):
         """The trunk: positions ``(N, 3)`` to hidden units ``(N, width)``."""
         centre = self.bounds.mean(0)
         third = (self.bounds[1] - self.bounds[0]).max() / 3
-        encoded = ops.encode((x - centre) / third, self.position_octaves)
+        encoded = positional_encoding((x - centre) / third, self.position_octaves)
         before, after = self.trunk[: self.skip + 1], self.trunk[self.skip + 1 :]
         hidden = torch.relu(ops.mlp(encoded, _pairs(before), precision=self.precision))
-        again = torch.cat([encoded, hidden], dim=-1)
-        return torch.relu(ops.mlp(again, _pairs(after), precision=self.precision))
+        again = [ops.Block(encoded, 0), ops.Block(hidden, 0)]
+        return torch.relu(ops.encoded_mlp(again, _pairs(after), precision=self.precision))
 
     def _density_of(self, hidden: Tensor) -> Tensor:
         """Hidden units ``(N, width)`` to densities ``(N,)`` per world unit."""
@@ -162,17 +162,9 @@ class MLPField(nn.Module):
         return self._colour_of(features, directions, ray_indices)
 
     def _colour_of(self, hidden: Tensor, directions: Tensor, ray_indices: Tensor | None) -> Tensor:
-        first, last = (cast(nn.Linear, layer) for layer in self.colour_layers)
-        encoded = ops.encode(directions, self.direction_octaves)
-        weight, columns = first.weight, encoded.shape[1]
-        out = ops.mlp(
-            ops.mlp(hidden, _pairs([self.bottleneck]), precision=self.precision),
-            [(weight[:, columns:], None), (last.weight, last.bias)],
-            offset=F.linear(encoded, weight[:, :columns], first.bias),
-            rows=ray_indices,
-            precision=self.precision,
-        )
-        return torch.sigmoid(out)
+        hidden = ops.mlp(hidden, _pairs([self.bottleneck]), precision=self.precision)
+        blocks = [ops.Block(directions, self.direction_octaves, ray_indices), ops.Block(hidden, 0)]
+        return torch.sigmoid(ops.encoded_mlp(blocks, _pairs(self.colour_layers), precision=self.precision))
 
     def march_density(
         self,

@@ -62,18 +62,18 @@ def test_an_empty_cache_starts_it(tmp_path):
         """
         import time
         from gridreg.ops.cpu import reductions as sums
-        from gridreg.ops.encode import _forward
+        from gridreg.ops.cpu.vm import _density
         sums._measure.address
         # Of the second process; this one has no use for it.
         end = time.monotonic() + 100
-        while not _forward.cached and time.monotonic() < end:
+        while not _density.cached and time.monotonic() < end:
             time.sleep(0.1)
-        assert _forward.cached
-        _forward.address
+        assert _density.cached
+        _density.address
         """,
         GRIDREG_COMPILE_AHEAD="1",
     )
-    assert {"encode._forward", "reductions._measure"} <= set(compiled)
+    assert {"vm._density", "reductions._measure"} <= set(compiled)
 
 
 def test_not_where_it_is_forbidden_or_of_no_use(monkeypatch):

@@ -14,7 +14,7 @@ from gridreg.errors import InputError
 from gridreg.ops.cpu import lookups
 from gridreg.ops.cpu.reductions import round_stochastically
 from gridreg.ops.interpolation import LINE_AXES, PLANE_AXES
-from gridreg.ops.linear import product_dtype
+from gridreg.ops.perceptron import product_dtype
 
 from . import common, machine, step
 from .common import Record

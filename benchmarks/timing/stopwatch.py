@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
@@ -14,7 +13,6 @@ import torch
 
 import gridreg.training.trainer as trainer_module
 from gridreg import ops
-from gridreg.ops import linear
 from gridreg.ops.cpu import cp, lookups, vm_gradient
 from gridreg.ops.cpu.mlp import fused as perceptron
 from gridreg.rendering import render
@@ -126,9 +124,7 @@ def places_of(trainer: Trainer) -> list[Place]:
         Place(cp, "density_backward", "backward/density"),
         Place(vm_gradient, "features_backward", "backward/lookup"),
         Place(cp, "features_backward", "backward/lookup"),
-        Place(sys.modules[ops.encoded_mlp.__module__], "chain_backward", "backward/network"),
         Place(perceptron, "gradients", "backward/network"),
-        Place(linear, "chain_backward", "backward/network"),
         Place(trainer.optimizer, "step", "optimiser"),
     ]
     hooks = ("step", "update_groups", "background", "near_far", "on_samples", "loss", "grid_terms")

@@ -11,12 +11,10 @@ import importlib.util
 from gridreg.ops.composite import accumulate, composite_weights, pixels, terminate
 from gridreg.ops.cp import cp_density, cp_features, cp_march_density
 from gridreg.ops.dispatch import chosen_backend, use_backend
-from gridreg.ops.encode import encode, encode_together
-from gridreg.ops.encoded_mlp import Block, encoded_mlp
 from gridreg.ops.fused_adam import FusedAdam
 from gridreg.ops.gradient_buffers import accumulate_into_grad
-from gridreg.ops.linear import Layer, mlp, product_dtype
 from gridreg.ops.merging import merge_samples, spread_to_samples
+from gridreg.ops.perceptron import Block, Layer, encoded_mlp, mlp, product_dtype
 from gridreg.ops.ray_marching import Activation, MarchArguments, RayMarchResult, march, march_density
 from gridreg.ops.vm import vm_density, vm_features, vm_march_density
 
@@ -34,8 +32,6 @@ __all__ = [
     "cp_density",
     "cp_features",
     "cp_march_density",
-    "encode",
-    "encode_together",
     "encoded_mlp",
     "march",
     "march_density",

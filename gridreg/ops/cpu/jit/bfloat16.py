@@ -9,7 +9,7 @@ from numba import types
 
 from gridreg.ops.cpu.jit.compiler import intrinsic
 
-__all__ = ["get", "load_low", "put", "store_low"]
+__all__ = ["get", "load_low", "put", "rounded", "store_low"]
 
 
 def _kinds(lanes: Any) -> tuple[Any, Any, Any]:
@@ -37,17 +37,21 @@ def _load(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     return builder.bitcast(builder.shl(builder.zext(bits, word), _constant(word, 16)), real)
 
 
-def _store(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    _, word, half = _kinds(arguments[2].type)
-    bits = builder.bitcast(arguments[2], word)
+def rounded(builder: Any, value: Any) -> Any:
+    """Bits of float32 rounded to the nearest bfloat16, ties to even; NaN stays NaN."""
+    _, word, half = _kinds(value.type)
+    bits = builder.bitcast(value, word)
     upper = builder.lshr(bits, _constant(word, 16))
     even = builder.and_(upper, _constant(word, 1))
-    rounded = builder.lshr(builder.add(bits, builder.add(even, _constant(word, 0x7FFF))), _constant(word, 16))
+    nearest = builder.lshr(builder.add(bits, builder.add(even, _constant(word, 0x7FFF))), _constant(word, 16))
     # Rounding would carry the payload of a NaN over into infinity or zero.
-    hidden = builder.fcmp_unordered("uno", arguments[2], arguments[2])
-    found = builder.select(hidden, builder.or_(upper, _constant(word, 0x40)), rounded)
-    pointer = _pointer(context, builder, signature, arguments, half)
-    builder.store(builder.trunc(found, half), pointer, align=2)
+    hidden = builder.fcmp_unordered("uno", value, value)
+    return builder.trunc(builder.select(hidden, builder.or_(upper, _constant(word, 0x40)), nearest), half)
+
+
+def _store(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    found = rounded(builder, arguments[2])
+    builder.store(found, _pointer(context, builder, signature, arguments, found.type), align=2)
     return context.get_dummy_value()
 
 

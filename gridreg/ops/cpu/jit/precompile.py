@@ -23,7 +23,6 @@ __all__ = ["main", "start"]
 _SWITCH = "GRIDREG_COMPILE_AHEAD"
 # Of a run with a VM field, from the one that it compiles last.
 _ORDER = (
-    "encode._forward",
     "cpu.vm._density",
     "cpu.adam.kernels.flat_step",
     "cpu.adam.kernels.grid_step",
@@ -34,20 +33,16 @@ _ORDER = (
     "cpu.composite._weights_backward",
     "cpu.vm_gradient._bf16_features_backward",
     "cpu.counting_sort._sort",
-    "cpu.mlp.dots._low",
-    "cpu.mlp.dots._sum_rows",
     "cpu.reductions._reduce",
-    "cpu.mlp.fused_bf16.backward",
-    "cpu.mlp.fused_f32.backward",
+    "cpu.mlp.kernels.backward_bf16",
+    "cpu.mlp.kernels.backward_f32",
     "cpu.merging._gather",
     "cpu.composite._pixels_backward",
     "cpu.composite._pixels_forward",
     "cpu.merging._spread",
-    "cpu.mlp.fused_bf16.forward",
-    "cpu.mlp.fused_f32.forward",
+    "cpu.mlp.kernels.forward_bf16",
+    "cpu.mlp.kernels.forward_f32",
 )
-# Modules that only a processor with dot products of bfloat16 needs, and that only others need.
-_DOTS, _OTHERS = ("cpu.mlp.dots", "cpu.mlp.fused_bf16"), ("cpu.mlp.fused_f32",)
 
 
 def start() -> subprocess.Popen[bytes] | None:
@@ -83,7 +78,7 @@ def main() -> None:
     """Compile until there is a kernel that another process has compiled."""
     for name in _ORDER:
         module, _, function = name.rpartition(".")
-        if module in (_OTHERS if has("avx512bf16") else _DOTS):
+        if function.endswith("_f32" if has("avx512bf16") else "_bf16"):
             continue
         kernel = getattr(importlib.import_module(f"gridreg.ops.{module}"), function)
         if kernel.cached:

@@ -1,44 +1,49 @@
-"""What blocks of matrix products have in common whose results stay in registers: their sizes, and the loop."""
+"""Register tiles: LLVM IR for a block of a matrix product that stays in registers while it is summed up.
+
+A tile has some rows and 16 or 32 columns; how many follows from the registers that the processor has. Each step of
+its sum takes one number of every row, in float32, or a pair of numbers, in bfloat16, whose products are summed in
+float32: by one instruction where the processor has it (AVX-512 BF16), else by two multiply-adds. At its end stands an
+epilogue: what a layer does with the sum before it is written.
+"""
 
 from __future__ import annotations
 
 import functools
+import inspect
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 from llvmlite import binding, ir  # type: ignore[import-untyped]
-from numba import config
+from numba import config, types
+from numba.core import cgutils
+
+from gridreg.ops.cpu.jit.bfloat16 import rounded
+from gridreg.ops.cpu.jit.compiler import intrinsic
 
 __all__ = [
-    "INDEX",
-    "LONG",
-    "REALS",
-    "ROWS",
-    "SUMMED",
-    "TASKS",
-    "WIDEST",
-    "ahead",
-    "everywhere",
+    "BF16",
+    "COLUMNS",
+    "F32",
+    "Arithmetic",
+    "Epilogue",
+    "TileArguments",
+    "element",
     "has",
-    "places_of",
-    "relu",
-    "summed",
+    "register_tile",
+    "round_lanes",
 ]
 
-WIDEST = 512
-"""Columns of the widest matrix."""
-
-# Rows whose factors stay in the nearest caches, for products and for sums over rows.
-ROWS = 32
-SUMMED = 64
-# Tasks that share the rows of a sum.
-TASKS = 16
-
-LONG = 16
+COLUMNS = 16
 """Columns of a vector of results."""
-INDEX = ir.IntType(64)
-REALS = ir.VectorType(ir.FloatType(), LONG)
-_WORD = ir.IntType(32)
+
+Epilogue: TypeAlias = Literal["accumulate", "bias", "relu", "relu_mask"]
+"""Add to what stands in the output; add one number a column; that and a ReLU; 0 where the argument is not positive."""
+
+_INDEX, _WORD, _HALF = ir.IntType(64), ir.IntType(32), ir.IntType(16)
+_FLOATS, _WORDS = ir.VectorType(ir.FloatType(), COLUMNS), ir.VectorType(_WORD, COLUMNS)
+_HALVES = ir.VectorType(_HALF, COLUMNS)
+_ZERO = ir.Constant(_FLOATS, [0.0] * COLUMNS)
+_FLAGS = ("contract", "nsz")
 
 
 @functools.cache
@@ -53,61 +58,235 @@ def has(feature: str) -> bool:
         return False
 
 
-def ahead(builder: Any, pointer: Any, index: Any, like: Any = REALS) -> Any:
+class _BFloat(ir.types.Type):  # type: ignore[misc]
+    """LLVM's bfloat, which llvmlite has no name for."""
+
+    def _to_string(self) -> str:
+        return "bfloat"
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _BFloat)
+
+    def __hash__(self) -> int:
+        return hash(_BFloat)
+
+
+class Arithmetic(NamedTuple):
+    """How a tile multiplies.
+
+    Args:
+        word: LLVM type of what a row gives to a step.
+        per_word: numbers in it.
+        rows: of a tile.
+        wide: whether there are registers for 32 columns.
+        operand: a vector of words to what `multiply_add` takes.
+        multiply_add: a sum and two operands to the sum after the step.
+    """
+
+    word: Any
+    per_word: int
+    rows: int
+    wide: bool
+    operand: Callable[[Any, Any], Any]
+    multiply_add: Callable[[Any, Any, Any, Any], Any]
+
+
+def _float_step(builder: Any, total: Any, left: Any, right: Any) -> Any:
+    return builder.fadd(total, builder.fmul(left, right, flags=_FLAGS), flags=_FLAGS)
+
+
+def _native_pairs(builder: Any, words: Any) -> Any:
+    return builder.bitcast(words, ir.VectorType(_BFloat(), 2 * COLUMNS))
+
+
+def _native_step(builder: Any, total: Any, left: Any, right: Any) -> Any:
+    kind = ir.FunctionType(_FLOATS, [_FLOATS, left.type, right.type])
+    name = "llvm.x86.avx512bf16.dpbf16ps.512"
+    dot = cgutils.get_or_insert_function(builder.module, kind, name)  # type: ignore[no-untyped-call]
+    return builder.call(dot, [total, left, right])
+
+
+def _portable_pairs(builder: Any, words: Any) -> tuple[Any, Any]:
+    """Both numbers of each word as float32."""
+    first = builder.shl(words, ir.Constant(_WORDS, [16] * COLUMNS))
+    second = builder.and_(words, ir.Constant(_WORDS, [0xFFFF0000] * COLUMNS))
+    return builder.bitcast(first, _FLOATS), builder.bitcast(second, _FLOATS)
+
+
+def _portable_step(builder: Any, total: Any, left: Any, right: Any) -> Any:
+    # The instruction's order: the second number first.
+    return _float_step(builder, _float_step(builder, total, left[1], right[1]), left[0], right[0])
+
+
+_NATIVE = has("avx512bf16")
+# 16 registers of results of 32 (AVX-512), or 8 of 16.
+_ROWS, _WIDE = (8, True) if has("avx512f") else (4, False)
+
+F32 = Arithmetic(ir.FloatType(), 1, _ROWS, _WIDE, lambda builder, words: words, _float_step)
+BF16 = (
+    Arithmetic(_WORD, 2, 8, True, _native_pairs, _native_step)
+    if _NATIVE
+    else Arithmetic(_WORD, 2, _ROWS, _WIDE, _portable_pairs, _portable_step)
+)
+
+
+def element(builder: Any, pointer: Any, index: Any, like: Any = _FLOATS) -> Any:
     """Pointer to a vector of type ``like`` that begins at an element."""
     return builder.bitcast(builder.gep(pointer, [index]), like.as_pointer())
 
 
-def everywhere(builder: Any, value: Any) -> Any:
-    """A vector of ``value`` in all of `LONG` lanes."""
-    kind = ir.VectorType(value.type, LONG)
+def round_lanes(builder: Any, value: Any) -> Any:
+    """Eight or sixteen float32 rounded to bfloat16; subnormal numbers become 0 where the processor does it."""
+    if not _NATIVE:
+        return rounded(builder, value)
+    lanes = value.type.count
+    kind = ir.FunctionType(ir.VectorType(_BFloat(), lanes), [value.type])
+    name = f"llvm.x86.avx512bf16.cvtneps2bf16.{32 * lanes}"
+    convert = cgutils.get_or_insert_function(builder.module, kind, name)  # type: ignore[no-untyped-call]
+    return builder.call(convert, [value])
+
+
+def _broadcast(builder: Any, value: Any) -> Any:
+    """A vector of ``value`` in all lanes."""
+    kind = ir.VectorType(value.type, COLUMNS)
     undefined = ir.Constant(kind, ir.Undefined)
     first = builder.insert_element(undefined, value, _WORD(0))
-    return builder.shuffle_vector(first, undefined, ir.Constant(ir.VectorType(_WORD, LONG), [0] * LONG))
+    return builder.shuffle_vector(first, undefined, ir.Constant(_WORDS, [0] * COLUMNS))
 
 
-def places_of(builder: Any, to: Any, row: Any, high: int, vectors: int) -> list[Any]:
-    """Where the vectors of a block begin: of each of ``high`` rows, ``row`` elements apart, all ``vectors``."""
-    return [
-        builder.add(builder.add(to, builder.mul(row, INDEX(r))), INDEX(LONG * v))
-        for r in range(high)
-        for v in range(vectors)
-    ]
-
-
-def summed(
-    builder: Any, before: Sequence[Any], count: Any, grow: Callable[[Any, Sequence[Any]], Sequence[Any]]
+def _loop(
+    builder: Any, before: Sequence[Any], count: Any, step: Callable[[Any, Sequence[Any]], Sequence[Any]]
 ) -> list[Any]:
-    """A loop that lets sums grow ``count`` times; the builder stands behind it then.
+    """A loop over sums; the builder stands behind it then.
 
     Args:
         builder: where it begins.
         before: the sums at first.
-        count: int64.
-        grow: the number of a turn and the sums to the sums after it.
+        count: of turns, int64.
+        step: the number of a turn and the sums before it to the sums after it.
     """
     entry = builder.block
     head, body, end = (builder.append_basic_block(name) for name in ("turns", "turn", "done"))
     builder.branch(head)
     builder.position_at_end(head)
-    number = builder.phi(INDEX)
-    number.add_incoming(INDEX(0), entry)
+    number = builder.phi(_INDEX)
+    number.add_incoming(_INDEX(0), entry)
     sums = []
     for value in before:
-        sums.append(builder.phi(REALS))
+        sums.append(builder.phi(_FLOATS))
         sums[-1].add_incoming(value, entry)
     builder.cbranch(builder.icmp_signed("<", number, count), body, end)
     builder.position_at_end(body)
-    grown = grow(number, sums)
-    number.add_incoming(builder.add(number, INDEX(1)), body)
-    for value, larger in zip(sums, grown, strict=True):
-        value.add_incoming(larger, body)
+    after = step(number, sums)
+    number.add_incoming(builder.add(number, _INDEX(1)), body)
+    for total, value in zip(sums, after, strict=True):
+        total.add_incoming(value, body)
     builder.branch(head)
     builder.position_at_end(end)
     return sums
 
 
-def relu(builder: Any, value: Any) -> Any:
-    """Not-a-number stays."""
-    nothing = ir.Constant(REALS, [0.0] * LONG)
-    return builder.select(builder.fcmp_ordered("<=", value, nothing), nothing, value)
+class TileArguments(NamedTuple):
+    """Of a tile. What begins, and all distances of left and right, count in words; those of the output in elements.
+
+    Args:
+        left, left_start, left_row, left_step: array; its word of the first row and step; distance of rows, of steps.
+        right, right_start, right_step, right_panel: array; its first vector; distance of steps, of vectors of a step.
+        steps: of the sum.
+        out, out_start, out_row: array of float32 or, if of uint16, bfloat16; first element; distance of rows.
+        argument, argument_start: of the epilogue: a number a column from ``argument_start`` on; or, of a ReLU mask,
+            an array like the output, ``argument_start`` elements further on.
+    """
+
+    left: Any
+    left_start: Any
+    left_row: Any
+    left_step: Any
+    right: Any
+    right_start: Any
+    right_step: Any
+    right_panel: Any
+    steps: Any
+    out: Any
+    out_start: Any
+    out_row: Any
+    argument: Any
+    argument_start: Any
+
+
+def register_tile(arithmetic: Arithmetic, vectors: int, epilogue: Epilogue) -> Any:
+    """An intrinsic for a tile of 16 columns for each of ``vectors``; it takes `TileArguments`."""
+
+    def tile(context: Any, *given: Any) -> Any:
+        kinds = TileArguments(*given)
+
+        def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+            at = TileArguments(*values)
+            left, right, out, argument = (
+                context.make_array(getattr(kinds, name))(context, builder, getattr(at, name)).data
+                for name in ("left", "right", "out", "argument")
+            )
+            left, right = (builder.bitcast(x, arithmetic.word.as_pointer()) for x in (left, right))
+            words = ir.VectorType(arithmetic.word, COLUMNS)
+            places = [
+                builder.add(
+                    builder.add(at.out_start, builder.mul(at.out_row, _INDEX(row))), _INDEX(COLUMNS * v)
+                )
+                for row in range(arithmetic.rows)
+                for v in range(vectors)
+            ]
+            before = [_ZERO] * len(places)
+            if epilogue == "accumulate":
+                before = [builder.load(element(builder, out, place), align=4) for place in places]
+
+            def step(number: Any, sums: Sequence[Any]) -> list[Any]:
+                first = builder.add(at.right_start, builder.mul(number, at.right_step))
+                factors = []
+                for v in range(vectors):
+                    place = builder.add(first, builder.mul(at.right_panel, _INDEX(v)))
+                    vector = builder.load(element(builder, right, place, words), align=4)
+                    factors.append(arithmetic.operand(builder, vector))
+                start = builder.add(at.left_start, builder.mul(number, at.left_step))
+                after: list[Any] = []
+                for row in range(arithmetic.rows):
+                    place = builder.add(start, builder.mul(at.left_row, _INDEX(row)))
+                    one = _broadcast(builder, builder.load(builder.gep(left, [place])))
+                    one = arithmetic.operand(builder, one)
+                    for factor in factors:
+                        after.append(arithmetic.multiply_add(builder, sums[len(after)], one, factor))
+                return after
+
+            sums = _loop(builder, before, at.steps, step)
+            for number, (place, value) in enumerate(zip(places, sums, strict=True)):
+                if epilogue in ("bias", "relu"):
+                    column = builder.add(at.argument_start, _INDEX(COLUMNS * (number % vectors)))
+                    value = builder.fadd(value, builder.load(element(builder, argument, column), align=4))
+                if epilogue == "relu":
+                    # Not-a-number stays.
+                    value = builder.select(builder.fcmp_ordered("<=", value, _ZERO), _ZERO, value)
+                if epilogue == "relu_mask":
+                    seen = builder.add(place, at.argument_start)
+                    value = builder.select(_positive(builder, argument, seen), value, _ZERO)
+                if kinds.out.dtype == types.uint16:
+                    value = round_lanes(builder, value)
+                builder.store(
+                    value, element(builder, out, place, value.type), align=kinds.out.dtype.bitwidth // 8
+                )
+            return context.get_dummy_value()
+
+        integers = (kind if isinstance(kind, types.Array) else types.int64 for kind in given)
+        return types.void(*integers), generate
+
+    # numba reads off how many arguments there are.
+    positional = inspect.Parameter.POSITIONAL_OR_KEYWORD
+    names = ("context", *TileArguments._fields)
+    tile.__signature__ = inspect.Signature([inspect.Parameter(name, positional) for name in names])  # type: ignore[attr-defined]
+    return intrinsic(tile)
+
+
+def _positive(builder: Any, array: Any, place: Any) -> Any:
+    """Whether numbers are above 0; of bfloat16 the sign of the bits says it."""
+    if array.type.pointee == ir.FloatType():
+        return builder.fcmp_ordered(">", builder.load(element(builder, array, place), align=4), _ZERO)
+    halves = builder.load(element(builder, array, place, _HALVES), align=2)
+    return builder.icmp_signed(">", halves, ir.Constant(_HALVES, [0] * COLUMNS))
