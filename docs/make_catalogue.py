@@ -6,7 +6,6 @@ python docs/make_catalogue.py --check    exit with status 1 if the page is stale
 
 from __future__ import annotations
 
-import argparse
 import inspect
 import re
 import sys
@@ -14,6 +13,9 @@ from collections.abc import Sequence
 from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parent))
+from generated import write_or_check
 
 import gridreg
 from gridreg.base import REGISTRY, Regularizer, overrides
@@ -117,21 +119,9 @@ def page() -> str:
     return f"{HEAD}{kinds}\n\n{head}" + "\n".join(map(row_of, classes)) + "\n"
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Write or check the page; the exit status."""
-    parser = argparse.ArgumentParser(description="Write docs/catalogue.md from the docstrings.")
-    parser.add_argument("--check", action="store_true", help="only say whether the page is stale")
-    check = parser.parse_args(arguments).check
-    text = page()
-    stale = not PAGE.is_file() or PAGE.read_text(encoding="utf-8") != text
-    if check:
-        print(f"{PAGE.name} is {'stale: run python docs/make_catalogue.py' if stale else 'up to date'}")
-        return int(stale)
-    if stale:
-        beside = PAGE.with_suffix(".tmp")
-        beside.write_text(text, encoding="utf-8")
-        beside.replace(PAGE)
-    return 0
+def main(words: Sequence[str] | None = None) -> int:
+    """Write or check the page; return the exit status."""
+    return write_or_check(words, "make_catalogue.py", lambda: {PAGE: page()})
 
 
 if __name__ == "__main__":

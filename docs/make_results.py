@@ -8,7 +8,6 @@ The page's words stand in docs/results.md.jinja, the rows of its tables in docs/
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,9 +15,8 @@ from pathlib import Path
 import jinja2
 
 sys.path.insert(0, str(Path(__file__).parent))
+from generated import write_or_check
 from results_tables import Results
-
-from gridreg.training.files import write_text
 
 TEMPLATE = Path(__file__).with_name("results.md.jinja")
 PAGE, README = Path(__file__).with_name("results.md"), Path(__file__).parents[1] / "README.md"
@@ -41,23 +39,13 @@ def with_front(readme: str, front: str) -> str:
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Write or check the page and the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--check", action="store_true", help="only say whether they are up to date")
-    arguments = parser.parse_args(words)
-    results = Results()
-    readme = with_front(README.read_text(encoding="utf-8"), results.front())
-    written = {PAGE: page(results), README: readme}
-    stale = [path for path, text in written.items() if path.read_text(encoding="utf-8") != text]
-    if arguments.check:
-        names = ", ".join(path.name for path in stale)
-        print(f"{names}: stale; run python docs/make_results.py" if stale else "up to date")
-        return int(bool(stale))
-    for path in stale:
-        write_text(path, written[path])
-    return 0
+    """Write or check the page and the table; return the exit status."""
+
+    def texts() -> dict[Path, str]:
+        results = Results()
+        return {PAGE: page(results), README: with_front(README.read_text(encoding="utf-8"), results.front())}
+
+    return write_or_check(words, "make_results.py", texts)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The site around the pages: pictures drawn by the code, what happens to them, and readable docstrings."""
+"""The site around the pages: diagrams drawn by the code, what happens to them, and readable docstrings."""
 
 from __future__ import annotations
 
@@ -18,44 +18,44 @@ DOCS = Path(__file__).parent.parent / "docs"
 
 
 @pytest.fixture
-def make_pictures(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
+def make_diagrams(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
     """The script that draws them."""
     monkeypatch.syspath_prepend(DOCS)
-    yield importlib.import_module("make_pictures")
-    for name in [name for name in sys.modules if name == "make_pictures" or name.split(".")[0] == "drawing"]:
+    yield importlib.import_module("make_diagrams")
+    for name in [name for name in sys.modules if name == "make_diagrams" or name.split(".")[0] == "drawing"]:
         del sys.modules[name]
 
 
-def test_pictures_are_up_to_date(make_pictures: ModuleType, capsys: pytest.CaptureFixture[str]) -> None:
-    status = make_pictures.main(["--check"])
+def test_diagrams_are_up_to_date(make_diagrams: ModuleType, capsys: pytest.CaptureFixture[str]) -> None:
+    status = make_diagrams.main(["--check"])
     assert status == 0, capsys.readouterr().out
 
 
-def test_stale_pictures_are_noticed_and_written_anew(
-    make_pictures: ModuleType,
+def test_stale_diagrams_are_noticed_and_written_anew(
+    make_diagrams: ModuleType,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     line = '<svg><path d="M10 20.5L{} 7"/></svg>'
-    monkeypatch.setattr(make_pictures, "pictures", lambda: {"a": line.format(30), "b": line.format(40)})
-    assert make_pictures.main([], tmp_path) == 0
-    assert make_pictures.main(["--check"], tmp_path) == 0
+    monkeypatch.setattr(make_diagrams, "diagrams", lambda: {"a": line.format(30), "b": line.format(40)})
+    assert make_diagrams.main([], tmp_path) == 0
+    assert make_diagrams.main(["--check"], tmp_path) == 0
     # Rounding is forgiven, a different value, a missing or a left-over file is not.
     (tmp_path / "a.svg").write_text(line.format(30.1))
-    assert make_pictures.main(["--check"], tmp_path) == 0
+    assert make_diagrams.main(["--check"], tmp_path) == 0
     (tmp_path / "a.svg").write_text(line.format(31))
     (tmp_path / "b.svg").unlink()
     (tmp_path / "c.svg").write_text(line.format(1))
-    assert make_pictures.main(["--check"], tmp_path) == 1
+    assert make_diagrams.main(["--check"], tmp_path) == 1
     assert "stale: a.svg, b.svg, c.svg;" in capsys.readouterr().out
-    assert make_pictures.main([], tmp_path) == 0
+    assert make_diagrams.main([], tmp_path) == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.svg", "b.svg"]
-    assert make_pictures.main(["--check"], tmp_path) == 0
+    assert make_diagrams.main(["--check"], tmp_path) == 0
 
 
-def test_pictures_are_small_and_whole() -> None:
-    files = sorted((DOCS / "pictures").glob("*"))
+def test_diagrams_are_small_and_whole() -> None:
+    files = sorted((DOCS / "diagrams").glob("*"))
     assert {path.suffix for path in files} == {".svg"}
     assert sum(path.stat().st_size for path in files) < 200_000
     for path in files:
@@ -67,13 +67,13 @@ def test_pictures_are_small_and_whole() -> None:
             assert 0 <= float(text.attrib["y"]) <= height
 
 
-def test_pages_show_every_picture_with_a_description() -> None:
+def test_pages_show_every_diagram_with_a_description() -> None:
     shown = set()
     for path in {*DOCS.rglob("*.md")} - {DOCS / "results.md"}:
         for text, target in re.findall(r"!\[(.*?)\]\((.*?)\)", path.read_text(encoding="utf-8")):
             assert len(text.split()) >= 5, f"{path.name}: {target} needs a description"
             shown.add((path.parent / target).resolve())
-    assert shown == set((DOCS / "pictures").resolve().glob("*.svg"))
+    assert shown == set((DOCS / "diagrams").resolve().glob("*.svg"))
 
 
 # --- the site's own code
@@ -91,14 +91,14 @@ def test_results_enter_the_menu_once_they_are_there(tmp_path: Path) -> None:
     ]
 
 
-def test_pictures_go_inline(tmp_path: Path) -> None:
+def test_diagrams_go_inline(tmp_path: Path) -> None:
     hooks = module_at(DOCS / "web" / "hooks.py")
-    (tmp_path / "pictures").mkdir()
+    (tmp_path / "diagrams").mkdir()
     drawn = (
         '<svg xmlns="http://www.w3.org/2000/svg" class="gr"><style>.gr { color: red }</style><path/></svg>\n'
     )
-    (tmp_path / "pictures" / "a.svg").write_text(drawn)
-    page = '<p><img alt="a &lt; b" src="../pictures/a.svg" /> <img alt="" src="other.png" /></p>'
+    (tmp_path / "diagrams" / "a.svg").write_text(drawn)
+    page = '<p><img alt="a &lt; b" src="../diagrams/a.svg" /> <img alt="" src="other.png" /></p>'
     inlined = hooks.on_page_content(page, {"docs_dir": str(tmp_path)}, page=None, files=None)
     assert inlined == (
         '<p><svg role="img" aria-label="a &lt; b" class="gr"><path/></svg> <img alt="" src="other.png" /></p>'

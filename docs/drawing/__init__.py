@@ -1,1 +1,1 @@
-"""The pictures of the documentation, drawn from what the code computes."""
+"""The diagrams of the documentation, drawn from what the code computes."""

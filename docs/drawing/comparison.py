@@ -1,4 +1,4 @@
-"""Pictures of where the published sources contradict each other."""
+"""Diagrams of where the published sources contradict each other."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ def reach() -> str:
     return panel.svg()
 
 
-def pictures() -> dict[str, str]:
+def diagrams() -> dict[str, str]:
     """SVG text by name."""
     return {
         **forms(),

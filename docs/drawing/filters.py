@@ -1,4 +1,4 @@
-"""Pictures of low-passes: what passes, and what it does to a line of a grid."""
+"""Diagrams of low-passes: what passes, and what it does to a line of a grid."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def lines(title: str, shown: list[tuple[str, np.ndarray]]) -> str:
     return panel.svg()
 
 
-def pictures() -> dict[str, str]:
+def diagrams() -> dict[str, str]:
     """SVG text by name."""
     grid = gridreg.parameters("grid", dim=0)
     fourier = [(f"keep={keep}", filtered(gridreg.FourierLowPass(grid, keep), 0)) for keep in (0.05, 0.3)]

@@ -1,4 +1,4 @@
-"""Pictures of masks: what a field gets to see of a grid of ones, at every step of a run."""
+"""Diagrams of masks: what a field gets to see of a grid of ones, at every step of a run."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def encoding_labels(coordinates: str, octaves: Sequence[int]) -> list[str]:
     return [*coordinates, *waves]
 
 
-def pictures() -> dict[str, str]:
+def diagrams() -> dict[str, str]:
     """SVG text by name."""
     coordinate = gridreg.octaves_of_channels(2, 4, "coordinate")
     octave = gridreg.octaves_of_channels(2, 4, "octave")

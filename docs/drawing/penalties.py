@@ -1,4 +1,4 @@
-"""Pictures of penalties: their values over the one thing that each of them is about."""
+"""Diagrams of penalties: their values over the one thing that each of them is about."""
 
 from __future__ import annotations
 
@@ -197,7 +197,7 @@ def angle() -> str:
     return panel.svg()
 
 
-def pictures() -> dict[str, str]:
+def diagrams() -> dict[str, str]:
     """SVG text by name."""
     smooth, divergence = neighbours()
     return {

@@ -1,4 +1,4 @@
-"""Pictures of schedules, and of regularizers of sampling, gradients and optimizer."""
+"""Diagrams of schedules, and of regularizers of sampling, gradients and optimizer."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def decayed(share: float, steps: int) -> list[float]:
     return values
 
 
-def pictures() -> dict[str, str]:
+def diagrams() -> dict[str, str]:
     """SVG text by name."""
     return {
         **schedules(),

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 Range = tuple[float, float]
 
 WIDTH = 340
-_STYLESHEET = Path(__file__).parent.parent / "pictures.css"
+_STYLESHEET = Path(__file__).parent.parent / "diagrams.css"
 
 
 def standalone_style() -> str:
@@ -63,7 +63,7 @@ class Panel:
         x, y: ranges of the axes.
         x_label, y_label: what the axes show, with the unit.
         x_ticks, y_ticks: numbers, or (number, text).
-        height: of the picture, pixels.
+        height: of the diagram, pixels.
         log_y: whether the vertical axis is logarithmic.
         left: room for the labels of the vertical axis, pixels.
     """
@@ -117,7 +117,7 @@ class Panel:
         self._parts.append(self._text(column, row, text, anchor=anchor, style=style))
 
     def svg(self) -> str:
-        """The picture."""
+        """The diagram."""
         return document(self._parts, self.height)
 
     def _axes(

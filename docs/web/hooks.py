@@ -1,4 +1,4 @@
-"""What the site does to its pages: pictures go inline, and nothing may come from another server."""
+"""What the site does to its pages: diagrams go inline, and nothing may come from another server."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-_PICTURE = re.compile(r'<img alt="([^"]*)" src="(?:\.\./)*(pictures/[\w-]+\.svg)" ?/?>')
+_DIAGRAM = re.compile(r'<img alt="([^"]*)" src="(?:\.\./)*(diagrams/[\w-]+\.svg)" ?/?>')
 _FOREIGN = re.compile(
     r'<(?:script|img|iframe|source)\b[^>]*\bsrc="(?:https?:)?//[^"]*"'
     r'|<link\b[^>]*\bhref="(?:https?:)?//[^"]*"'
@@ -23,12 +23,12 @@ def on_config(config: Any) -> Any:
 
 
 def on_page_content(text: str, config: Any, **_: Any) -> str:
-    """A page's HTML with its pictures inside, so that they follow the page's colours."""
+    """A page's HTML with its diagrams inside, so that they follow the page's colours."""
     return inlined(text, Path(config["docs_dir"]))
 
 
 def inlined(text: str, docs: Path) -> str:
-    """HTML in which the project's own pictures are no longer references to files."""
+    """HTML in which the project's own diagrams are no longer references to files."""
 
     def drawing(found: re.Match[str]) -> str:
         svg = (docs / found[2]).read_text(encoding="utf-8")
@@ -38,7 +38,7 @@ def inlined(text: str, docs: Path) -> str:
         )
         return svg.replace("<svg ", f'<svg role="img" aria-label="{found[1]}" ', 1).strip()
 
-    return _PICTURE.sub(drawing, text)
+    return _DIAGRAM.sub(drawing, text)
 
 
 def foreign(text: str) -> list[str]:
