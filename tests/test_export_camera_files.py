@@ -77,8 +77,12 @@ class TestFiles:
     @pytest.mark.parametrize(
         ("text", "said"),
         [
-            ("{", "not a camera file"),
-            ("[]", "found no list 'frames'"),
+            ("{", "not valid JSON"),
+            ("[]", "found a list, expected a JSON object"),
+            (
+                '{"w": 4, "h": 3, "frames": [{"fl_x": 4, "cx": 9, "transform_matrix": EYE}]}',
+                "principal point",
+            ),
             ('{"frames": []}', "found no list 'frames'"),
             ('{"frames": [3]}', "frame 0: has no transform_matrix"),
             ('{"frames": [{"transform_matrix": [[1]]}]}', r"frame 0: transform_matrix has shape \(1, 1\)"),
@@ -98,8 +102,8 @@ class TestFiles:
         assert "\n" not in str(error.value)
 
     def test_missing_and_binary_files(self, tmp_path):
-        with pytest.raises(InputError, match="No such file"):
+        with pytest.raises(InputError, match="file not found"):
             load_cameras(tmp_path / "none.json")
         (tmp_path / "b.json").write_bytes(b"\xff\xfe\x00")
-        with pytest.raises(InputError, match="not a camera file"):
+        with pytest.raises(InputError, match="not valid JSON"):
             load_cameras(tmp_path / "b.json")

@@ -5,13 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from gridreg.errors import InputError
-from gridreg.export import LiveView, draw_run, live_view, video_path
+from gridreg.export import LiveView, draw_run, live_view, save_cameras, video_path, write_mesh
 from gridreg.rendering.cameras import Camera, Lens
-from gridreg.scenes import Scene, builtin_scene, load_scene
+from gridreg.scenes import Scene, World, builtin_scene, load_scene
 from gridreg.training import Execution, RunConfig, build_trainer, execute, load_run
 from gridreg.training.curves import History
 from gridreg.training.rays import warp_of
@@ -61,6 +62,25 @@ def test_a_loaded_run_looks_like_the_trained_one(scene: Scene, tmp_path: Path) -
     bare = loaded.render(camera)
     assert bare is not None
     assert not torch.equal(bare.colour, two.colour)
+
+
+def test_a_run_in_a_world_that_was_moved(scene: Scene, tmp_path: Path) -> None:
+    far = replace(scene, world=World((430_000.0, 5_200_000.0, 300.0), 50.0))
+    run, _ = execute(CONFIG, far, tmp_path / "run")
+    loaded = load_run(tmp_path / "run")
+    assert loaded.world == far.world
+    options = {"resolution": 16, "threshold": 0.01, "colours": False, "min_component": 0.0}
+    at_home = write_mesh(loaded.field, tmp_path / "home.ply", **options)
+    outside = write_mesh(loaded.field, tmp_path / "far.ply", world=loaded.world, **options)
+    np.testing.assert_allclose(outside.vertices, far.world.outward(at_home.vertices))
+    # A camera file counts in the world of the scene's files, as its mesh does.
+    camera = Camera(torch.eye(4), Lens((9.0, 9.0, 4.0, 4.0), 8, 8))
+    moved = torch.eye(4)
+    moved[:3, 3] = torch.tensor([430_050.0, 5_200_000.0, 300.0])
+    save_cameras(tmp_path / "path.json", [replace(camera, pose=moved)])
+    (found,) = video_path(loaded, None, tmp_path / "path.json", world=loaded.world)
+    torch.testing.assert_close(found.pose[:3, 3], torch.tensor([1.0, 0, 0]))
+    assert run.scene.world == far.world
 
 
 def test_video_paths(scene: Scene, forward: Scene) -> None:

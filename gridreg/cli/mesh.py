@@ -51,6 +51,7 @@ def run(options: MeshOptions) -> int:
         target,
         loaded.occupancy,
         resolution=options.resolution,
+        world=loaded.world,
         threshold=options.threshold,
         min_component=options.min_component,
         colours=options.colours,

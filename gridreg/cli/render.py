@@ -71,6 +71,7 @@ def run(options: RenderOptions) -> int:
         width=options.width,
         elevation=options.elevation,
         radius=options.radius,
+        world=runs[0].world,
     )
     name = Path(options.path).stem if options.path else "spiral" if runs[0].warp else "turntable"
     target = options.out if options.out is not None else folder_of(first) / f"{name}.mp4"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,9 @@ import torch
 
 from gridreg.errors import InputError
 from gridreg.rendering.cameras import Camera, Lens
-from gridreg.scenes.gate import check_pose
+from gridreg.scenes import IN_PLACE, World
+from gridreg.scenes.files import read_json
+from gridreg.scenes.gate import check_cameras, check_pose
 from gridreg.training.files import write_json
 
 __all__ = ["load_cameras", "save_cameras"]
@@ -35,7 +36,7 @@ def save_cameras(path: str | Path, cameras: Sequence[Camera]) -> None:
     write_json(path, {"frames": frames})
 
 
-def load_cameras(path: str | Path, lens: Lens | None = None) -> list[Camera]:
+def load_cameras(path: str | Path, lens: Lens | None = None, world: World = IN_PLACE) -> list[Camera]:
     """Read a camera file: what `save_cameras` writes, or any ``transforms.json`` (without its images).
 
     Every frame has a ``transform_matrix``. The lens (``fl_x``, or ``camera_angle_x`` in radians; optionally
@@ -45,19 +46,15 @@ def load_cameras(path: str | Path, lens: Lens | None = None) -> list[Camera]:
     Args:
         path: the file.
         lens: for what the file leaves out.
+        world: where the wanted coordinates lie in the world of the file.
 
     Raises:
         InputError: if the file is missing, is not such a list, lacks a key, or holds what is not a rigid
             pose.
     """
     path = Path(path)
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot read the camera file: {error.strerror or error}") from error
-    except ValueError as error:
-        raise InputError(f"{path}: not a camera file: {str(error).splitlines()[0]}") from error
-    frames = data.get("frames") if isinstance(data, dict) else None
+    data = read_json(path)
+    frames = data.get("frames")
     if not isinstance(frames, list) or not frames:
         raise InputError(
             f"{path}: found no list 'frames', expected at least one frame with a transform_matrix"
@@ -67,8 +64,11 @@ def load_cameras(path: str | Path, lens: Lens | None = None) -> list[Camera]:
         where = f"{path}, frame {number}"
         if not isinstance(frame, dict) or "transform_matrix" not in frame:
             raise InputError(f"{where}: has no transform_matrix")
-        pose = torch.from_numpy(check_pose(frame["transform_matrix"], where)).float()
-        cameras.append(Camera(pose, _lens({**data, **frame}, lens, where)))
+        pose = world.inward(check_pose(frame["transform_matrix"], where)[None])[0]
+        camera = Camera(torch.from_numpy(pose).float(), _lens({**data, **frame}, lens, where))
+        size = camera.lens.width, camera.lens.height
+        check_cameras(camera.pose[None], [camera.lens.intrinsics], size, [where])
+        cameras.append(camera)
     return cameras
 
 

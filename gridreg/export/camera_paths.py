@@ -14,7 +14,7 @@ from gridreg.errors import InputError
 from gridreg.export.camera_files import load_cameras
 from gridreg.export.cameras import Orbit, Vector, look_at, orbit_of_box, orbit_of_views, up_axis
 from gridreg.rendering.cameras import Camera, Lens
-from gridreg.scenes import Views
+from gridreg.scenes import IN_PLACE, Views, World
 from gridreg.scenes.extent import focus_point
 
 __all__ = [
@@ -41,6 +41,7 @@ def camera_path(
     width: int | None = None,
     elevation: float | None = None,
     radius: float | None = None,
+    world: World = IN_PLACE,
 ) -> list[Camera]:
     """The cameras of a video by name.
 
@@ -54,6 +55,8 @@ def camera_path(
         width: of the images, pixels; None: that of the views, or 400.
         elevation: of the turntable, degrees; None: the median of the views'.
         radius: of turntable and spiral, world units; None: the median of the views'.
+
+        world: where the field's coordinates lie in the world of the scene's files, in which a camera file counts.
 
     Raises:
         InputError: for an unknown name, numbers out of range, "train" without views, or a bad file.
@@ -69,7 +72,7 @@ def camera_path(
             raise InputError(
                 f"path: found {str(name)!r}, expected {', '.join(CAMERA_PATHS)} or a camera file"
             )
-        loaded = load_cameras(name, lens)
+        loaded = load_cameras(name, lens, world)
         return loaded if width is None else [Camera(c.pose, c.lens.resized(width)) for c in loaded]
     if name == "train":
         if views is None:

@@ -6,7 +6,7 @@ import io
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from gridreg.errors import InputError
 from gridreg.export.marching import Faces, Vertices, drop_small_components, polygonise, vertex_normals
 from gridreg.export.volume import SeenDensity, sample_density, surface_threshold
 from gridreg.rendering import Field, OccupancyGrid
+from gridreg.scenes import IN_PLACE, World
 from gridreg.segments import optical_depth_to_weights
 from gridreg.training.files import check_output_folder, writing
 
@@ -201,15 +202,17 @@ def write_mesh(
     occupancy: OccupancyGrid | None = None,
     *,
     resolution: int = 256,
+    world: World = IN_PLACE,
     **options: Any,
 ) -> Mesh:
-    """`extract_mesh` and `save_mesh` in one.
+    """`extract_mesh` and `save_mesh` in one, in the world of the scene's files.
 
     Args:
         field: the field.
         path: file to write; its suffix chooses the format.
         occupancy: as for `extract_mesh`.
         resolution: as for `extract_mesh`.
+        world: where the field's coordinates lie in the world of the scene's files.
         options: further arguments of `extract_mesh`.
 
     Raises:
@@ -218,6 +221,8 @@ def write_mesh(
     # Before minutes of work, not after.
     _check_target(Path(path))
     mesh = extract_mesh(field, occupancy, resolution=resolution, **options)
+    if world != IN_PLACE:
+        mesh = replace(mesh, vertices=world.outward(mesh.vertices))
     save_mesh(mesh, path)
     return mesh
 

@@ -13,14 +13,16 @@ from gridreg.scenes.llff import ndc_rays
 from gridreg.scenes.load import default_protocol, load_scene
 from gridreg.scenes.prepare import Prepared, prepare
 from gridreg.scenes.protocols import PROTOCOLS, Protocol, get_protocol
-from gridreg.scenes.views import Scene, Views, background_colour
+from gridreg.scenes.views import IN_PLACE, Scene, Views, World, background_colour
 
 __all__ = [
+    "IN_PLACE",
     "PROTOCOLS",
     "Prepared",
     "Protocol",
     "Scene",
     "Views",
+    "World",
     "background_colour",
     "builtin_depth",
     "builtin_mesh",

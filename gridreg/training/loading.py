@@ -11,6 +11,7 @@ import gridreg
 from gridreg.errors import InputError
 from gridreg.fields import make_field
 from gridreg.rendering import Ensemble, Model, OccupancyGrid
+from gridreg.scenes import IN_PLACE, World
 from gridreg.training.checkpoint import has_checkpoint, load_checkpoint
 from gridreg.training.config import from_data
 from gridreg.training.events import march_of
@@ -33,12 +34,14 @@ class LoadedRun(Model):
         config: of the run; of an ensemble, the first member's.
         step: iterations done; of an ensemble, the fewest of its members'.
         fingerprint: of the scene it was trained on, see `gridreg.scenes.Scene`.
+        world: where the scene lies in the world of its files.
         members: the runs that an ensemble is made of, else none.
     """
 
     config: RunConfig
     step: int
     fingerprint: str
+    world: World = IN_PLACE
     members: tuple[LoadedRun, ...] = ()
 
 
@@ -130,6 +133,7 @@ def _run(plain: Any, state: dict[str, Any], fingerprint: str, source: str) -> Lo
         config=config,
         step=int(trainer["step"]),
         fingerprint=fingerprint,
+        world=World(tuple(saved["origin"]), saved["unit"]) if (saved := state.get("world")) else IN_PLACE,
     )
 
 

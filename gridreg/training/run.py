@@ -14,7 +14,7 @@ import gridreg
 from gridreg.base import Regularizer
 from gridreg.errors import InputError
 from gridreg.fields import make_field
-from gridreg.scenes import Scene, builtin_scene, default_protocol, load_scene
+from gridreg.scenes import IN_PLACE, Scene, builtin_scene, default_protocol, load_scene
 from gridreg.training.checkpoint import load_checkpoint, save_checkpoint
 from gridreg.training.config import to_data
 from gridreg.training.events import carved_box, resolution_of
@@ -89,6 +89,8 @@ def save_run(folder: Path, trainer: Trainer, config: RunConfig, record: dict[str
         "background": trainer.scene.background,
         "record": record,
     }
+    if trainer.scene.world != IN_PLACE:
+        state["world"] = {"origin": list(trainer.scene.world.origin), "unit": trainer.scene.world.unit}
     save_checkpoint(folder, state, config=to_data(config), fingerprint=trainer.scene.fingerprint)
 
 
