@@ -250,13 +250,13 @@ def test_studies_of_the_page_are_accepted():
 def test_the_page_lists_every_key_and_option():
     import dataclasses
 
-    from gridreg.ablation.rows import _KEYS
+    from gridreg.ablation.rows import KEYS
     from gridreg.ablation.study_file import StudyFile
 
     page = PAGE.read_text()
     for field in dataclasses.fields(StudyFile):
         assert f"`{field.name}`" in page, field.name
-    for kind, keys in _KEYS.items():
+    for kind, keys in KEYS.items():
         assert all(re.search(rf"\b{key}\b", page) for key in (kind, *keys)), kind
     for field in dataclasses.fields(AblationOptions):
         name = field.name.replace("_", "-")

@@ -90,7 +90,7 @@ def test_selectors(selector, count):
     ("selector", "message"),
     [
         ("FrequencMask", "unknown regularizer 'FrequencMask'; did you mean 'FrequencyMask'"),
-        ({"nam": "L1"}, "unknown key 'nam'; did you mean 'name'"),
+        ({"nam": "L1"}, "nam: unknown key, did you mean name?"),
         ({}, "expected NAME"),
         (3, "expected NAME"),
     ],
@@ -143,7 +143,7 @@ def test_replace_swaps_in_place():
     [
         ("L1", "expected {name"),
         ({"name": "L1", "with": {"wait": 3}}, r"(?s)unknown argument 'wait'.*weight"),
-        ({"name": "L1", "withs": {}, "with": {}}, "unknown key 'withs'"),
+        ({"name": "L1", "withs": {}, "with": {}}, "withs: unknown key; valid: name, site"),
         ({"name": "WeightDecay", "with": {"decay": 3}}, "which the composition does not have"),
     ],
 )

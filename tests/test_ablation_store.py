@@ -278,6 +278,19 @@ def test_export_csv(store, tmp_path):
     assert rows[0]["hash"] == spec("a, b").hash
 
 
+def test_cells_that_begin_like_formulas_are_text(store, tmp_path):
+    labels = ["=1+1", "+x", "-x", "@x", "\tx", "x=1", "−1"]
+    store.add(study_of(*(spec(label) for label in labels)))
+    store.fail(claimed(store), "=HYPERLINK(1)")
+    finish(store, claimed(store), -2.5)
+    with store.export(tmp_path / "table.csv", "study").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["label"] for row in rows] == ["'=1+1", "'+x", "'-x", "'@x", "'\tx", "x=1", "−1"]
+    assert rows[0]["reason"] == "'=HYPERLINK(1)"
+    # Numbers stay numbers.
+    assert rows[1]["psnr"] == "-2.5"
+
+
 def test_export_parquet(store, tmp_path):
     parquet = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed")
     store.add(study_of(spec("a"), spec("b")))

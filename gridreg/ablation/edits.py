@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Any
 
 from gridreg.base import REGISTRY
 from gridreg.compositions.named import RETIRED, composition, composition_names
 from gridreg.compositions.plain_data import from_config, to_config
-from gridreg.errors import InputError, near_names
+from gridreg.errors import ConfigError, InputError, near_names
 from gridreg.training.presets import load_preset, preset_names
+from gridreg.training.typed_data import from_data
 
 __all__ = [
     "Plain",
@@ -20,7 +22,6 @@ __all__ = [
     "matches",
     "normalised",
     "parts_of",
-    "refuse_unknown",
     "removed",
     "replaced",
     "title_of",
@@ -28,18 +29,6 @@ __all__ = [
 
 Plain = list[dict[str, Any]]
 """A composition as `gridreg.to_config` writes it."""
-
-
-def refuse_unknown(found: Mapping[str, Any], valid: Sequence[str], what: str) -> None:
-    """Refuse keys that are not valid, with the nearest that is.
-
-    Raises:
-        InputError: for the first unknown key.
-    """
-    for key in found:
-        if key not in valid:
-            hint = near_names(key, valid) or ";"
-            raise InputError(f"{what}: unknown key {key!r}{hint} valid: {', '.join(valid)}")
 
 
 def normalised(entries: Any) -> Plain:
@@ -109,10 +98,10 @@ def matches(regularizer: Mapping[str, Any], selector: Any) -> bool:
     Raises:
         InputError: if it is none of these.
     """
-    name, site = _selector(selector)
-    if name is not None and regularizer["name"] != name:
+    wanted = _selector(selector)
+    if wanted.name is not None and regularizer["name"] != wanted.name:
         return False
-    return site is None or fnmatchcase(_site(regularizer), site)
+    return wanted.site is None or fnmatchcase(_site(regularizer), wanted.site)
 
 
 def removed(plain: Plain, selectors: Any) -> Plain:
@@ -140,8 +129,9 @@ def replaced(plain: Plain, entries: Any) -> Plain:
     """
     for entry in _listed(entries, "replace"):
         if not isinstance(entry, Mapping) or not isinstance(entry.get("with"), Mapping):
-            raise InputError(f"replace: found {entry!r}, expected {{name: NAME, site: SITE, with: {{...}}}}")
-        refuse_unknown(entry, ("name", "site", "with"), "replace")
+            raise ConfigError(
+                ("replace",), f"found {entry!r}, expected {{name: NAME, site: SITE, with: {{...}}}}"
+            )
         selector = {key: value for key, value in entry.items() if key != "with"}
         _check_match(plain, selector, "replace")
         plain = [_changed(r, entry["with"]) if matches(r, selector) else r for r in plain]
@@ -174,35 +164,25 @@ def parts_of(plain: Plain, parts: Any, by: str) -> dict[str, Plain]:
     Raises:
         InputError: for parts that hold nothing, or share a regularizer.
     """
-    if parts is None:
-        return _automatic_parts(plain, by)
-    if not isinstance(parts, Mapping) or not parts:
-        raise InputError(f"parts: found {parts!r}, expected names of parts, each with its regularizers")
+    keys = {"name": lambda r: str(r["name"]), "site": lambda r: _site(r) or str(r["name"]), "each": title_of}
     found: dict[str, Plain] = {}
+    if parts is None:
+        if by not in keys:
+            raise ConfigError(("by",), f"found {by!r}, expected one of {', '.join(keys)}")
+        for regularizer in plain:
+            found.setdefault(keys[by](regularizer), []).append(regularizer)
+        return found
+    if not isinstance(parts, Mapping) or not parts:
+        raise ConfigError(("parts",), f"found {parts!r}, expected names of parts, each with its regularizers")
     taken: dict[int, str] = {}
     for name, selectors in parts.items():
-        chosen: Plain = []
         for selector in selectors if isinstance(selectors, list) else [selectors]:
             _check_match(plain, selector, f"parts: {name}")
             for index, regularizer in enumerate(plain):
-                if matches(regularizer, selector) and taken.get(index) != name:
-                    if index in taken:
-                        raise InputError(
-                            f"parts: {title_of(regularizer)} is in {taken[index]!r} and in {name!r}; expected once"
-                        )
-                    taken[index] = name
-                    chosen.append(regularizer)
-        found[name] = chosen
-    return found
-
-
-def _automatic_parts(plain: Plain, by: str) -> dict[str, Plain]:
-    keys = {"name": lambda r: str(r["name"]), "site": lambda r: _site(r) or str(r["name"]), "each": title_of}
-    if by not in keys:
-        raise InputError(f"by: found {by!r}, expected one of {', '.join(keys)}")
-    found: dict[str, Plain] = {}
-    for regularizer in plain:
-        found.setdefault(keys[by](regularizer), []).append(regularizer)
+                if matches(regularizer, selector) and taken.setdefault(index, name) != name:
+                    twice = f"{title_of(regularizer)} is in {taken[index]!r} and in {name!r}; expected once"
+                    raise ConfigError(("parts",), twice)
+        found[name] = [regularizer for index, regularizer in enumerate(plain) if taken.get(index) == name]
     return found
 
 
@@ -224,30 +204,36 @@ def _site(regularizer: Mapping[str, Any]) -> str:
     return "" if site is None else str(site)
 
 
-def _selector(selector: Any) -> tuple[str | None, str | None]:
+@dataclass(frozen=True)
+class _Selector:
+    name: str | None = None
+    site: str | None = None
+
+
+def _selector(selector: Any) -> _Selector:
     if isinstance(selector, str) and selector.strip():
         name, _, site = selector.strip().partition(" ")
-        found: tuple[str | None, str | None] = (name, site.strip() or None)
+        found = _Selector(name, site.strip() or None)
     elif isinstance(selector, Mapping) and selector:
-        refuse_unknown(selector, ("name", "site"), "regularizer")
-        found = (selector.get("name"), selector.get("site"))
+        found = from_data(_Selector, selector, source="")
     else:
         raise InputError(f"found {selector!r}, expected NAME, NAME SITE or {{name: NAME, site: SITE}}")
-    if found[0] is not None and found[0] not in REGISTRY:
-        raise InputError(f"unknown regularizer {found[0]!r}{near_names(found[0], sorted(REGISTRY))}")
+    if found.name is not None and found.name not in REGISTRY:
+        raise InputError(f"unknown regularizer {found.name!r}{near_names(found.name, sorted(REGISTRY))}")
     return found
 
 
-def _check_match(plain: Plain, selector: Any, what: str) -> None:
+def _check_match(plain: Plain, selector: Any, key: str) -> None:
     if not [regularizer for regularizer in plain if matches(regularizer, selector)]:
         there = ", ".join(title_of(r) for r in plain) or "no regularizer at all"
         shown = selector if isinstance(selector, str) else " ".join(str(v) for v in dict(selector).values())
-        raise InputError(f"{what}: found {shown!r}, which the composition does not have; it has {there}")
+        problem = f"found {shown!r}, which the composition does not have; it has {there}"
+        raise ConfigError((key,), problem)
 
 
-def _listed(value: Any, what: str) -> list[Any]:
+def _listed(value: Any, key: str) -> list[Any]:
     if isinstance(value, (str, Mapping)):
         return [value]
     if not isinstance(value, list) or not value:
-        raise InputError(f"{what}: found {value!r}, expected a list of regularizers")
+        raise ConfigError((key,), f"found {value!r}, expected a list of regularizers")
     return value

@@ -40,7 +40,7 @@ def export_results(results: Sequence[RunResult], path: Path) -> Path:
         text = io.StringIO()
         writer = csv.DictWriter(text, fieldnames=list(rows[0]) if rows else ["label"], lineterminator="\n")
         writer.writeheader()
-        writer.writerows(rows)
+        writer.writerows({key: _cell(value) for key, value in row.items()} for row in rows)
         write_text(path, text.getvalue())
     elif path.suffix == ".parquet":
         _write_parquet(rows, path)
@@ -49,6 +49,11 @@ def export_results(results: Sequence[RunResult], path: Path) -> Path:
             f"{path}: found the ending {path.suffix or 'of nothing'!r}, expected .csv or .parquet"
         )
     return path
+
+
+def _cell(value: Any) -> Any:
+    """A value for a spreadsheet, which would take text that begins like a formula for one and run it."""
+    return f"'{value}" if isinstance(value, str) and value.startswith(tuple("=+-@\t\r")) else value
 
 
 def _keys(results: Sequence[RunResult], group: str) -> list[str]:

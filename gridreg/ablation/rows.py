@@ -18,10 +18,10 @@ Every entry may hold ``preset``, ``backbone``, ``steps`` and ``set`` for its row
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from itertools import combinations
-from typing import Any
+from typing import Any, Literal
 
 from gridreg.ablation.edits import (
     Plain,
@@ -30,28 +30,30 @@ from gridreg.ablation.edits import (
     known_composition,
     normalised,
     parts_of,
-    refuse_unknown,
     removed,
     replaced,
     title_of,
 )
 from gridreg.compositions.named import composition as named_composition
 from gridreg.compositions.plain_data import to_config
-from gridreg.errors import InputError
+from gridreg.errors import ConfigError
+from gridreg.training.strict_yaml import Document
+from gridreg.training.typed_data import from_data
 
-__all__ = ["Row", "expand_rows"]
+__all__ = ["KEYS", "Row", "expand_rows"]
 
-_COMMON = ("preset", "backbone", "steps", "set")
-_EDITS = ("remove", "replace", "add")
-_PARTS = ("parts", "by", "label")
-_KEYS: dict[str, tuple[str, ...]] = {
-    "name": ("name", "label", *_EDITS, *_COMMON),
-    "regularizers": ("regularizers", "label", *_COMMON),
-    "leave_one_out": ("leave_one_out", *_PARTS, *_COMMON),
-    "one_at_a_time": ("one_at_a_time", "on", *_PARTS, *_COMMON),
-    "product": ("product", *_PARTS, *_COMMON),
-    "sweep": ("sweep", "change", "argument", "key", "values", "label", *_COMMON),
+KEYS: dict[str, tuple[str, ...]] = {
+    "name": ("remove", "replace", "add"),
+    "regularizers": (),
+    "leave_one_out": ("parts", "by"),
+    "one_at_a_time": ("on", "parts", "by"),
+    "product": ("parts", "by"),
+    "sweep": ("change", "argument", "key", "values"),
 }
+"""Keys beside the one that tells what an entry is; some are common to all."""
+
+_COMMON = ("label", "preset", "backbone", "steps", "set")
+_EDITS = {"remove": ("-", removed), "replace": ("~", replaced), "add": ("+", added)}
 _MOST_PARTS = 12
 
 
@@ -94,159 +96,161 @@ def expand_rows(entry: Any) -> list[Row]:
     """The rows of one entry.
 
     Raises:
-        InputError: for unknown names and keys, with the nearest; and for parts that are not there.
+        ConfigError: for unknown names and keys, with the nearest; and for parts that are not there.
 
     Example:
         >>> [row.label for row in expand_rows({"leave_one_out": "freenerf"})]
         ['freenerf', 'freenerf - FrequencyMask', 'freenerf - OcclusionLoss']
     """
-    kind = _kind_of(entry)
-    if kind in ("name", "regularizers"):
-        rows = [_plain_row(entry)]
-    else:
-        rows = _GENERATORS[kind](entry)
-    common = _common(entry)
-    # What a sweep varies stands above what the entry sets.
-    return [replace(row, **{**common, "set": {**common.get("set", {}), **row.set}}) for row in rows]
+    read = _read(entry)
+    return [
+        replace(
+            row,
+            preset=read.preset or row.preset,
+            backbone=read.backbone or row.backbone,
+            steps=read.steps or row.steps,
+            # What a sweep varies stands above what the entry sets.
+            set={**read.set, **row.set},
+        )
+        for row in _ROWS[read.kind](read)
+    ]
 
 
-def _kind_of(entry: Any) -> str:
-    if isinstance(entry, str):
-        return "name"
-    if not isinstance(entry, Mapping):
-        raise InputError(f"found {entry!r}, expected the name of a composition or a mapping")
-    kinds = [kind for kind in _KEYS if kind in entry]
-    if not kinds:
-        refuse_unknown(entry, sorted({key for keys in _KEYS.values() for key in keys}), "entry")
-    if len(kinds) != 1:
-        found = " and ".join(kinds) or ", ".join(map(str, entry)) or "nothing"
-        raise InputError(f"found {found}, expected exactly one of {', '.join(_KEYS)}")
-    refuse_unknown(entry, _KEYS[kinds[0]], kinds[0])
-    return kinds[0]
+_Selectors = str | dict[str, Any] | list[str | dict[str, Any]] | None
 
 
-def _plain_row(entry: Any) -> Row:
+@dataclass(frozen=True)
+class _Entry:
+    """Every key of an entry; which of them go together, `KEYS` says."""
+
+    name: str | None = None
+    regularizers: list[Any] | None = None
+    leave_one_out: Any = None
+    one_at_a_time: Any = None
+    product: Any = None
+    sweep: Any = None
+    label: str | None = None
+    preset: str | None = None
+    backbone: str | None = None
+    steps: int | None = None
+    set: dict[str, Any] = field(default_factory=dict)
+    remove: _Selectors = None
+    replace: _Selectors = None
+    add: _Selectors = None
+    on: Any = "none"
+    parts: dict[str, Any] | None = None
+    by: Literal["name", "site", "each"] | None = None
+    values: list[Any] = field(default_factory=list)
+    change: str | dict[str, Any] | None = None
+    argument: str | None = None
+    key: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.label is not None and not self.label.strip():
+            raise ConfigError(("label",), f"found {self.label!r}, expected text")
+        if self.steps is not None and self.steps < 1:
+            raise ConfigError(("steps",), f"found {self.steps}, expected an integer of at least 1")
+
+    @property
+    def kind(self) -> str:
+        return next(kind for kind in KEYS if getattr(self, kind) is not None)
+
+
+def _read(entry: Any) -> _Entry:
     if isinstance(entry, str):
         entry = {"name": entry}
-    label = entry.get("label")
-    if label is not None and (not isinstance(label, str) or not label.strip()):
-        raise InputError(f"label: found {label!r}, expected text")
-    if "regularizers" in entry:
-        if label is None:
-            raise InputError("label: missing; a composition written out needs a name for the tables")
-        return Row(label, normalised(entry["regularizers"]))
-    name = entry["name"]
-    if not isinstance(name, str):
-        raise InputError(f"name: found {name!r}, expected the name of a composition")
-    edits = {key: entry[key] for key in _EDITS if key in entry}
-    label = label or name.rpartition(":")[2] + "".join(_edit_titles(edits))
-    if name == "preset":
-        return Row(label, None, edits)
-    return Row(label, _edited(known_composition(name), edits))
+    if not isinstance(entry, Mapping):
+        raise ConfigError((), f"found {entry!r}, expected the name of a composition or a mapping")
+    read = from_data(_Entry, entry, source="")
+    kinds = [kind for kind in KEYS if entry.get(kind) is not None]
+    if len(kinds) != 1:
+        found = " and ".join(kinds) or ", ".join(map(str, entry)) or "nothing"
+        raise ConfigError((), f"found {found}, expected exactly one of {', '.join(KEYS)}")
+    valid = (kinds[0], *KEYS[kinds[0]], *_COMMON)
+    for key in entry:
+        if key not in valid:
+            raise ConfigError((key,), f"found beside {kinds[0]}, expected none but {', '.join(valid)}")
+    return read
 
 
-def _edited(plain: Plain, edits: Mapping[str, Any]) -> Plain:
-    for key, edit in (("remove", removed), ("replace", replaced), ("add", added)):
-        if key in edits:
-            plain = edit(plain, edits[key])
-    return plain
+def _named(entry: _Entry) -> list[Row]:
+    name, edits = str(entry.name), {k: getattr(entry, k) for k in _EDITS if getattr(entry, k) is not None}
+    plain = None if name == "preset" else _edited(known_composition(name), edits)
+    return [Row(entry.label or name.rpartition(":")[2] + _edit_titles(edits), plain, edits)]
 
 
-def _edit_titles(edits: Mapping[str, Any]) -> list[str]:
-    """`` - X``, `` ~ X`` and `` + X`` for what is removed, replaced and added."""
-    titles = []
-    for key, sign in (("remove", "-"), ("replace", "~"), ("add", "+")):
-        entries = edits.get(key, [])
-        for item in entries if isinstance(entries, list) else [entries]:
-            title = (
-                item
-                if isinstance(item, str)
-                else " ".join(str(item[k]) for k in ("name", "site") if k in item)
-            )
-            titles.append(f" {sign} {title}")
-    return titles
+def _written(entry: _Entry) -> list[Row]:
+    if entry.label is None:
+        raise ConfigError(("label",), "missing; a composition written out needs a name for the tables")
+    return [Row(entry.label, normalised(entry.regularizers))]
 
 
-def _base(entry: Mapping[str, Any], key: str) -> Row:
-    """The row that a generator starts from."""
-    value = entry[key]
-    if _kind_of(value) not in ("name", "regularizers"):
-        raise InputError(f"{key}: found a generator, expected one composition")
-    row = _plain_row(value)
-    if row.plain is None:
-        raise InputError(f"{key}: found 'preset', expected a composition or preset by its name")
-    if key in ("leave_one_out", "one_at_a_time", "product", "sweep") and "label" in entry:
-        row = replace(row, label=str(entry["label"]))
-    return replace(row, **_common(value))
+def _base(entry: _Entry, key: str, label: str | None) -> tuple[Row, Plain]:
+    """The row that a generator starts from, and its composition."""
+    value = getattr(entry, key)
+    with Document(value, "").locating(key):
+        if _read(value).kind not in ("name", "regularizers"):
+            raise ConfigError((), "found a generator, expected one composition")
+        (row,) = expand_rows(value)
+        if row.plain is None:
+            raise ConfigError((), "found 'preset', expected a composition or preset by its name")
+    return replace(row, label=label or row.label), row.plain
 
 
-def _leave_one_out(entry: Mapping[str, Any]) -> list[Row]:
-    base = _base(entry, "leave_one_out")
-    plain = base.plain or []
-    parts = _parts(entry, plain)
-    rows = [
-        replace(base, label=f"{base.label} - {name}", plain=_without(plain, part))
-        for name, part in parts.items()
-    ]
-    return [base, *rows]
+def _parts(entry: _Entry, plain: Plain) -> dict[str, Plain]:
+    if not plain:
+        raise ConfigError((), "found a composition without regularizers, expected one with parts to vary")
+    if entry.parts is not None and entry.by is not None:
+        raise ConfigError(("by",), "found beside parts, expected one of the two")
+    return parts_of(plain, entry.parts, entry.by or "name")
 
 
-def _one_at_a_time(entry: Mapping[str, Any]) -> list[Row]:
-    whole = _base(entry, "one_at_a_time")
-    on = _base({"on": "none", **entry}, "on")
-    parts = _parts(entry, whole.plain or [])
-    rows = [
-        replace(on, label=f"{on.label} + {name}", plain=[*(on.plain or []), *part])
-        for name, part in parts.items()
-    ]
-    return [on, *rows]
+def _leave_one_out(entry: _Entry) -> list[Row]:
+    base, plain = _base(entry, "leave_one_out", entry.label)
+    parts = _parts(entry, plain).items()
+    return [base, *(replace(base, label=f"{base.label} - {n}", plain=_without(plain, p)) for n, p in parts)]
 
 
-def _product(entry: Mapping[str, Any]) -> list[Row]:
-    base = _base(entry, "product")
-    plain = base.plain or []
+def _one_at_a_time(entry: _Entry) -> list[Row]:
+    _, whole = _base(entry, "one_at_a_time", None)
+    on, plain = _base(entry, "on", entry.label)
+    parts = _parts(entry, whole).items()
+    return [on, *(replace(on, label=f"{on.label} + {n}", plain=[*plain, *part]) for n, part in parts)]
+
+
+def _product(entry: _Entry) -> list[Row]:
+    base, plain = _base(entry, "product", entry.label)
     parts = _parts(entry, plain)
     if len(parts) > _MOST_PARTS:
-        raise InputError(
-            f"product: found {len(parts)} parts, expected at most {_MOST_PARTS} (2^{_MOST_PARTS} rows)"
-        )
+        most = f"expected at most {_MOST_PARTS} (2^{_MOST_PARTS} rows)"
+        raise ConfigError(("product",), f"found {len(parts)} parts, {most}")
     rows = []
-    for count in range(len(parts) + 1):
-        for left_out in combinations(parts, count):
-            without = [regularizer for name in left_out for regularizer in parts[name]]
-            label = base.label + "".join(f" - {name}" for name in left_out)
-            rows.append(replace(base, label=label, plain=_without(plain, without)))
+    for left_out in (names for count in range(len(parts) + 1) for names in combinations(parts, count)):
+        rest = _without(plain, [regularizer for name in left_out for regularizer in parts[name]])
+        rows.append(replace(base, label=base.label + "".join(f" - {n}" for n in left_out), plain=rest))
     return rows
 
 
-def _sweep(entry: Mapping[str, Any]) -> list[Row]:
-    base = _base(entry, "sweep")
-    values = entry.get("values")
-    if not isinstance(values, list) or not values:
-        raise InputError(f"values: found {values!r}, expected a list of values to try")
-    if ("key" in entry) == ("argument" in entry):
-        raise InputError(
-            "sweep: expected either argument (with change) or key, a dotted key of the configuration"
-        )
-    if "key" in entry:
-        key = str(entry["key"])
+def _sweep(entry: _Entry) -> list[Row]:
+    base, plain = _base(entry, "sweep", entry.label)
+    values, key, argument = entry.values, entry.key, entry.argument
+    if not values:
+        raise ConfigError(("values",), "found [], expected a list of values to try")
+    if (key is None) == (argument is None):
+        either = "expected either argument (with change) or key, a dotted key of the configuration"
+        raise ConfigError(("sweep",), either)
+    if key is not None:
         return [replace(base, label=f"{base.label}, {key}={v}", set={**base.set, key: v}) for v in values]
-    if "change" not in entry:
-        raise InputError(
-            "change: missing; expected the regularizers whose argument is varied, such as FrequencyMask"
-        )
-    argument = str(entry["argument"])
-    return [
-        replace(
-            base,
-            label=f"{base.label}, {argument}={value if not isinstance(value, Mapping) else dict(value)}",
-            plain=change_argument(base.plain or [], entry["change"], argument, value),
-        )
-        for value in values
-    ]
+    if entry.change is None:
+        missing = "missing; expected the regularizers whose argument is varied, such as FrequencyMask"
+        raise ConfigError(("change",), missing)
+    changed = [(v, change_argument(plain, entry.change, str(argument), v)) for v in values]
+    return [replace(base, label=f"{base.label}, {argument}={v}", plain=own) for v, own in changed]
 
 
-_GENERATORS: dict[str, Callable[[Mapping[str, Any]], list[Row]]] = {
+_ROWS = {
+    "name": _named,
+    "regularizers": _written,
     "leave_one_out": _leave_one_out,
     "one_at_a_time": _one_at_a_time,
     "product": _product,
@@ -254,29 +258,28 @@ _GENERATORS: dict[str, Callable[[Mapping[str, Any]], list[Row]]] = {
 }
 
 
-def _parts(entry: Mapping[str, Any], plain: Plain) -> dict[str, Plain]:
-    if not plain:
-        raise InputError("found a composition without regularizers, expected one with parts to vary")
-    if "parts" in entry and "by" in entry:
-        raise InputError("by: found beside parts, expected one of the two")
-    return parts_of(plain, entry.get("parts"), str(entry.get("by", "name")))
+def _edited(plain: Plain, edits: Mapping[str, Any]) -> Plain:
+    for key, (_, edit) in _EDITS.items():
+        if key in edits:
+            plain = edit(plain, edits[key])
+    return plain
+
+
+def _edit_titles(edits: Mapping[str, Any]) -> str:
+    """`` - X``, `` ~ X`` and `` + X`` for what is removed, replaced and added."""
+    titles = ""
+    for key, (sign, _) in _EDITS.items():
+        entries = edits.get(key, [])
+        for item in entries if isinstance(entries, list) else [entries]:
+            words = (
+                item
+                if isinstance(item, str)
+                else " ".join(str(item[k]) for k in ("name", "site") if k in item)
+            )
+            titles += f" {sign} {words}"
+    return titles
 
 
 def _without(plain: Plain, part: Plain) -> Plain:
     titles = [title_of(regularizer) for regularizer in part]
     return [r for r in plain if not (title_of(r) in titles and r in part)]
-
-
-def _common(entry: Any) -> dict[str, Any]:
-    """The entry's own preset, backbone, steps and values; they must be of their types."""
-    found = {key: entry[key] for key in _COMMON if isinstance(entry, Mapping) and key in entry}
-    for key, kind, expected in (
-        ("preset", str, "a name"),
-        ("backbone", str, "a name"),
-        ("steps", int, "an integer of at least 1"),
-        ("set", Mapping, "values by dotted key"),
-    ):
-        wrong = key in found and (not isinstance(found[key], kind) or found[key] is True)
-        if wrong or (key == "steps" and key in found and found[key] < 1):
-            raise InputError(f"{key}: found {found[key]!r}, expected {expected}")
-    return found

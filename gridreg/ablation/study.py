@@ -27,16 +27,19 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from gridreg.ablation.fitting import check_fits
+import torch
+
+import gridreg
 from gridreg.ablation.records import RunSpec, Study
 from gridreg.ablation.rows import Row, expand_rows
 from gridreg.ablation.study_file import StudyFile
 from gridreg.errors import ConfigError, InputError
-from gridreg.fields import field_names
+from gridreg.fields import field_names, make_field
 from gridreg.scenes.protocols import Every, Listed, Protocol, get_protocol
 from gridreg.training.config import from_data, override, to_data
 from gridreg.training.options import TrainOptions, configure
 from gridreg.training.presets import load_preset
+from gridreg.training.run import regularizers_of
 from gridreg.training.settings import RunConfig
 from gridreg.training.strict_yaml import parse_yaml
 
@@ -45,6 +48,7 @@ __all__ = ["BUILTIN_FRAMES", "DATA_VARIABLE", "import_modules", "load_study", "s
 DATA_VARIABLE = "GRIDREG_DATA"
 BUILTIN_FRAMES = 18
 _MOST_RUNS = 100_000
+_EDGE = 8
 
 
 def load_study(path: str | os.PathLike[str]) -> Study:
@@ -161,10 +165,14 @@ def _row_runs(file: StudyFile, label: str, config: RunConfig, scenes: Sequence[P
 
 
 def _check_fits(label: str, config: RunConfig) -> None:
+    """Attach the composition to a small field of this configuration, before hours of runs depend on it."""
+    bounds, generator = torch.tensor([[-1.0] * 3, [1.0] * 3]), torch.Generator().manual_seed(0)
     try:
-        check_fits(config)
-    except InputError as error:
-        raise ConfigError(("compositions",), f"row {label!r} with preset {config.preset}: {error}") from None
+        field = make_field(config.backbone, bounds, (_EDGE,) * 3, generator=generator, **config.field)
+        with gridreg.apply(field, *regularizers_of(config), total_steps=config.train.steps):
+            pass
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ConfigError(("compositions",), f"row {label!r} with preset {config.preset}: {error}") from error
 
 
 def _backbone_of(preset: str, key: str) -> str:
@@ -225,18 +233,19 @@ def _scene_folder(name: str, file: StudyFile, folder: Path) -> Path | None:
     """The folder of a scene, or None for the built-in one."""
     if name == "builtin":
         return None
-    data = folder / Path(file.data).expanduser() if file.data else None
+    # Unlike their like in pathlib, these functions take any name, however odd.
+    data = folder / os.path.expanduser(file.data) if file.data else None
     if data is None and os.environ.get(DATA_VARIABLE):
         data = Path(os.environ[DATA_VARIABLE])
     places = [data / name] if data is not None else []
     if data is None or len(Path(name).parts) > 1:
-        places += [folder / Path(name).expanduser()]
+        places += [folder / os.path.expanduser(name)]
     for place in places:
-        if place.is_dir():
+        if os.path.isdir(place):
             return place.resolve()
     hint = "" if data is not None else f"; the folder of scenes is given with data: or in {DATA_VARIABLE}"
     beside = places[0].parent
-    near = sorted(path.name for path in beside.iterdir() if path.is_dir())[:20] if beside.is_dir() else []
+    near = sorted(p.name for p in beside.iterdir() if p.is_dir())[:20] if os.path.isdir(beside) else []
     known = f" there are {', '.join(near)}" if near else ""
     looked = " or ".join(str(place) for place in places)
     raise ConfigError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from dataclasses import dataclass
 from typing import Any
 
@@ -52,6 +53,15 @@ class StudyFile:
     modules: list[str] = dataclasses.field(default_factory=list)
 
     def __post_init__(self) -> None:
+        # It becomes the name of a folder.
+        if self.name is not None and (
+            self.name in ("", ".", "..") or not re.fullmatch(r"[^/\\]+", self.name)
+        ):
+            raise ConfigError(
+                ("name",), f"found {self.name!r}, expected a name for a folder, without / or \\"
+            )
+        if self.name is not None and not self.name.isprintable():
+            raise ConfigError(("name",), f"found {self.name!r}, expected a name that can be printed")
         for key in ("compositions", "scenes", "seeds", "presets", "protocols", "views", "backbones"):
             values = getattr(self, key)
             if values == []:
