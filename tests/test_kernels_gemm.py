@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 import torch
 
-from gridreg.ops.cpu.jit.bfloat16 import load_low, store_low
-from gridreg.ops.cpu.jit.compiler import float32, kernel, next_task, uint16, vector
+from gridreg.ops.cpu.jit.compiler import kernel
 from gridreg.ops.cpu.jit.launch import launch
-from gridreg.ops.cpu.jit.simd import LANES, load, one, store, wide
+from gridreg.ops.cpu.jit.simd import LANES, load, scalar_zero, store, vector_zero
+from gridreg.ops.cpu.jit.table import float32, next_task, uint16, vector
 from gridreg.ops.cpu.mlp import gemm_tile
 from gridreg.ops.cpu.mlp.gemm import round_to_bf16
 
@@ -32,11 +32,11 @@ def _round_trip(table) -> None:
     while next_task(table) >= 0:
         split = x.shape[0] - x.shape[0] % LANES
         for i in range(0, split, LANES):
-            store_low(low, i, load(x, i, wide()))
-            store(back, i, load_low(low, i, wide()))
+            store(low, i, load(x, i, vector_zero()))
+            store(back, i, load(low, i, vector_zero()))
         for i in range(split, x.shape[0]):
-            store_low(low, i, load(x, i, one()))
-            store(back, i, load_low(low, i, one()))
+            store(low, i, load(x, i, scalar_zero()))
+            store(back, i, load(low, i, scalar_zero()))
 
 
 @kernel
@@ -44,7 +44,7 @@ def _rounded(table) -> None:
     x, low = vector(table, 0, float32), vector(table, 1, uint16)
     while next_task(table) >= 0:
         for i in range(0, x.shape[0], LANES):
-            round_to_bf16(low, i, load(x, i, wide()))
+            round_to_bf16(low, i, load(x, i, vector_zero()))
 
 
 def test_numbers_round_to_bfloat16_as_torch_rounds_them():

@@ -13,12 +13,14 @@ from numba.core import caching
 
 from gridreg.ops.cpu.jit import cache
 from gridreg.ops.cpu.jit import launch as threading
-from gridreg.ops.cpu.jit.compiler import (
+from gridreg.ops.cpu.jit.compiler import kernel
+from gridreg.ops.cpu.jit.launch import launch
+from gridreg.ops.cpu.jit.simd import LANES, load, prefetch, scalar_zero, store, total, vector_zero
+from gridreg.ops.cpu.jit.table import (
     cube,
     float32,
     int64,
     integer,
-    kernel,
     matrix,
     next_task,
     real,
@@ -27,8 +29,6 @@ from gridreg.ops.cpu.jit.compiler import (
     uint8,
     vector,
 )
-from gridreg.ops.cpu.jit.launch import launch
-from gridreg.ops.cpu.jit.simd import LANES, add_to, load, one, prefetch, store, total, wide
 from gridreg.ops.cpu.jit.workspace import workspace
 from tests.kernel_grids import threads
 
@@ -77,15 +77,15 @@ def _lanes(table):
             break
         for i in range(0, blocks, LANES):
             prefetch(x, i + LANES)
-            v = load(x, i, wide())
+            v = load(x, i, vector_zero())
             store(y, i, (v - float32(1)) * v + float32(2) * v * (float32(3) - v))
             sums[0] += total(v)
-            add_to(y, i, wide() + float32(0.5))
+            store(y, i, load(y, i, vector_zero()) + float32(0.5))
         for i in range(blocks, x.shape[0]):
-            v = load(x, i, one())
+            v = load(x, i, scalar_zero())
             store(y, i, (v - float32(1)) * v + float32(2) * v * (float32(3) - v))
             sums[0] += total(v)
-            add_to(y, i, one() + float32(0.5))
+            store(y, i, load(y, i, scalar_zero()) + float32(0.5))
 
 
 @pytest.mark.parametrize("count", [1, 2, 5])

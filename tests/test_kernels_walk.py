@@ -13,10 +13,11 @@ from hypothesis import strategies as st
 from gridreg import ops
 from gridreg.errors import InputError
 from gridreg.ops import use_backend
-from gridreg.ops.cpu.jit.compiler import float32, kernel, next_task, vector
+from gridreg.ops.cpu.jit.compiler import kernel
 from gridreg.ops.cpu.jit.launch import launch
-from gridreg.ops.cpu.jit.simd import LANES, load, one, store, wide
-from gridreg.ops.cpu.jit.softplus import softplus
+from gridreg.ops.cpu.jit.simd import LANES, load, scalar_zero, store, vector_zero
+from gridreg.ops.cpu.jit.simd_math import softplus
+from gridreg.ops.cpu.jit.table import float32, next_task, vector
 from tests.kernel_grids import close, make_grids, threads
 
 SCALE = 25.0
@@ -201,9 +202,9 @@ def _softplus(table):
         if task < 0:
             break
         for i in range(0, blocks, LANES):
-            store(out, i, softplus(load(x, i, wide()), wide()))
+            store(out, i, softplus(load(x, i, vector_zero()), vector_zero()))
         for i in range(blocks, x.shape[0]):
-            store(out, i, softplus(load(x, i, one()), one()))
+            store(out, i, softplus(load(x, i, scalar_zero()), scalar_zero()))
 
 
 def test_softplus():

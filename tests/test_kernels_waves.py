@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from gridreg.ops.cpu.jit.compiler import float32, kernel, next_task, vector
+from gridreg.ops.cpu.jit.compiler import kernel
 from gridreg.ops.cpu.jit.launch import launch
-from gridreg.ops.cpu.jit.simd import LANES, load, one, store, wide
-from gridreg.ops.cpu.jit.sincos import sine_and_cosine
+from gridreg.ops.cpu.jit.simd import LANES, load, scalar_zero, store, vector_zero
+from gridreg.ops.cpu.jit.simd_math import sine_and_cosine
+from gridreg.ops.cpu.jit.table import float32, next_task, vector
 
 
 @kernel
@@ -18,11 +19,11 @@ def _both(table) -> None:
     while next_task(table) >= 0:
         split = x.shape[0] - x.shape[0] % LANES
         for i in range(0, split, LANES):
-            s, c = sine_and_cosine(load(x, i, wide()))
+            s, c = sine_and_cosine(load(x, i, vector_zero()))
             store(sine, i, s)
             store(cosine, i, c)
         for i in range(split, x.shape[0]):
-            s, c = sine_and_cosine(load(x, i, one()))
+            s, c = sine_and_cosine(load(x, i, scalar_zero()))
             sine[i], cosine[i] = s, c
 
 

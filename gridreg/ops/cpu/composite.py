@@ -10,15 +10,9 @@ from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
 from gridreg.ops import composite as ops
-from gridreg.ops.cpu.jit.compiler import (
-    Matrix,
-    Vector,
-    float32,
-    int64,
-    kernel,
-    uint8,
-)
+from gridreg.ops.cpu.jit.compiler import kernel
 from gridreg.ops.cpu.jit.launch import launch
+from gridreg.ops.cpu.jit.table import Matrix, Vector, float32, int64, uint8
 
 __all__ = ["composite_weights", "pixels", "terminate"]
 

@@ -16,9 +16,10 @@ import torch
 from torch import Tensor
 
 from gridreg.ops.cpu.grid_coordinates import BATCH, COORDINATES, locate, node
-from gridreg.ops.cpu.jit.compiler import Vector, float32, inline, int32, int64, kernel, scratch
+from gridreg.ops.cpu.jit.compiler import inline, kernel
 from gridreg.ops.cpu.jit.launch import launch
-from gridreg.ops.cpu.jit.simd import load, one
+from gridreg.ops.cpu.jit.simd import load, scalar_zero
+from gridreg.ops.cpu.jit.table import Vector, float32, int32, int64, scratch
 from gridreg.ops.cpu.jit.workspace import workspace
 
 __all__ = ["ALONE", "ENTRY", "TASKS", "Listing", "list_by_row", "nonzero_gradients", "span"]
@@ -70,7 +71,7 @@ def _sort(
     found, between = scratch(COORDINATES, int32), scratch(COORDINATES, float32)
     edge, begin, base = edges[axis], axis * stride, axis * samples
     for n in range(samples):
-        rows[base + n] = node(load(u, 3 * n + axis, one()), edge)[0]
+        rows[base + n] = node(load(u, 3 * n + axis, scalar_zero()), edge)[0]
     _count(rows, base, samples, starts, begin, edge)
     for first in range(0, samples, BATCH):
         count = min(int64(BATCH), samples - first)

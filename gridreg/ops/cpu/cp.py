@@ -14,19 +14,10 @@ from torch import Tensor
 from gridreg.ops.cpu.counting_sort import ALONE, ENTRY, TASKS, list_by_row, nonzero_gradients, span
 from gridreg.ops.cpu.grid_coordinates import BATCH, COORDINATES, batch, locate
 from gridreg.ops.cpu.interpolation import Segment, linear, lookahead, prefetch_row
-from gridreg.ops.cpu.jit.compiler import (
-    Kernel,
-    Matrix,
-    Vector,
-    float32,
-    inline,
-    int32,
-    int64,
-    kernel,
-    scratch,
-)
+from gridreg.ops.cpu.jit.compiler import Kernel, inline, kernel
 from gridreg.ops.cpu.jit.launch import launch
-from gridreg.ops.cpu.jit.simd import LANES, load, one, store, total, wide
+from gridreg.ops.cpu.jit.simd import LANES, load, scalar_zero, store, total, vector_zero
+from gridreg.ops.cpu.jit.table import Matrix, Vector, float32, int32, int64, scratch
 from gridreg.ops.cpu.jit.workspace import workspace
 
 __all__ = ["density", "density_backward", "features", "features_backward", "product_sum", "segments_of"]
@@ -53,12 +44,12 @@ def _product(lines: Any, segments: Any, c: int, dtype_like: Any) -> Any:
 def product_sum(lines: Any, segments: Any, read: int) -> Any:
     """Sum over channels of the product of three lines."""
     blocks = read - read % LANES
-    lanes = wide()
+    lanes = vector_zero()
     for c in range(0, blocks, LANES):
-        lanes = lanes + _product(lines, segments, c, wide())
+        lanes = lanes + _product(lines, segments, c, vector_zero())
     value = total(lanes)
     for c in range(blocks, read):
-        value += _product(lines, segments, c, one())
+        value += _product(lines, segments, c, scalar_zero())
     return value
 
 
@@ -66,9 +57,9 @@ def product_sum(lines: Any, segments: Any, read: int) -> Any:
 def _write(lines: Any, segments: Any, read: int, out: Any, to: int) -> None:
     blocks = read - read % LANES
     for c in range(0, blocks, LANES):
-        store(out, to + c, _product(lines, segments, c, wide()))
+        store(out, to + c, _product(lines, segments, c, vector_zero()))
     for c in range(blocks, read):
-        store(out, to + c, _product(lines, segments, c, one()))
+        store(out, to + c, _product(lines, segments, c, scalar_zero()))
     for c in range(read, segments[0].across):
         out[to + c] = float32(0)
 
@@ -162,11 +153,11 @@ def _backward(
             )
             n = int64(nodes[e + 3]) * channels
             for c in range(0, blocks, LANES):
-                gc = wide() + g if summed else load(upstream, n + c, wide())
-                _add(others, segments, fraction, c, gc, to, wide())
+                gc = vector_zero() + g if summed else load(upstream, n + c, vector_zero())
+                _add(others, segments, fraction, c, gc, to, vector_zero())
             for c in range(blocks, read):
-                gc = g if summed else load(upstream, n + c, one())
-                _add(others, segments, fraction, c, gc, to, one())
+                gc = g if summed else load(upstream, n + c, scalar_zero())
+                _add(others, segments, fraction, c, gc, to, scalar_zero())
 
 
 @kernel

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from gridreg.ops.cpu.jit.compiler import Vector, exact, float32, inline, int32, int64
-from gridreg.ops.cpu.jit.simd import load, one
+from gridreg.ops.cpu.jit.compiler import exact, inline
+from gridreg.ops.cpu.jit.simd import load, scalar_zero
+from gridreg.ops.cpu.jit.table import Vector, float32, int32, int64
 
 __all__ = ["BATCH", "COORDINATES", "axes", "batch", "locate", "node"]
 
@@ -53,6 +54,6 @@ def locate(
     for axis in range(3):
         edge = int64(shape[axis])
         for q in range(count):
-            lower, fraction = node(load(u, 3 * (first + q) + axis, one()), edge)
+            lower, fraction = node(load(u, 3 * (first + q) + axis, scalar_zero()), edge)
             nodes[axis * BATCH + q] = lower
             fractions[axis * BATCH + q] = fraction

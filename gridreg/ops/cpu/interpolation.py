@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from gridreg.ops.cpu.jit.compiler import float32, inline
+from gridreg.ops.cpu.jit.compiler import inline
 from gridreg.ops.cpu.jit.simd import load, prefetch
+from gridreg.ops.cpu.jit.table import float32
 
 __all__ = [
     "Cell",

@@ -11,18 +11,9 @@ import torch
 from torch import Tensor
 
 from gridreg.ops import ray_marching as ops
-from gridreg.ops.cpu.jit.compiler import (
-    Cube,
-    Matrix,
-    Vector,
-    exact,
-    float32,
-    inline,
-    int64,
-    kernel,
-    uint8,
-)
+from gridreg.ops.cpu.jit.compiler import exact, inline, kernel
 from gridreg.ops.cpu.jit.launch import launch
+from gridreg.ops.cpu.jit.table import Cube, Matrix, Vector, float32, int64, uint8
 
 __all__ = ["MarchBits", "distance_of", "mark", "march", "next_bit", "sample_at"]
 

@@ -14,21 +14,11 @@ from torch import Tensor
 
 from gridreg.ops.cpu.cp import product_sum, segments_of
 from gridreg.ops.cpu.grid_coordinates import BATCH, COORDINATES, locate
-from gridreg.ops.cpu.jit.compiler import (
-    Cube,
-    Matrix,
-    Vector,
-    exact,
-    float32,
-    inline,
-    int32,
-    int64,
-    kernel,
-    scratch,
-)  # fmt: skip
+from gridreg.ops.cpu.jit.compiler import exact, inline, kernel
 from gridreg.ops.cpu.jit.launch import launch
-from gridreg.ops.cpu.jit.simd import LANES, load, store, wide
-from gridreg.ops.cpu.jit.softplus import softplus
+from gridreg.ops.cpu.jit.simd import LANES, load, store, vector_zero
+from gridreg.ops.cpu.jit.simd_math import softplus
+from gridreg.ops.cpu.jit.table import Cube, Matrix, Vector, float32, int32, int64, scratch
 from gridreg.ops.cpu.march import MarchBits, distance_of, next_bit, sample_at
 from gridreg.ops.cpu.vm import Batch, find_cells, look_up, shape_of
 from gridreg.ops.ray_marching import Activation, RayMarchResult
@@ -104,7 +94,10 @@ def _march_ray(
                     segments = segments_of(samples.nodes, samples.fractions, q, channels)
                     features[q] = product_sum((lines[2], lines[1], lines[0]), segments, read)
             # The last group of a ray is filled up with leftovers.
-            values = softplus(load(features, start, wide()) + density_of.shift, wide()) * density_of.scale
+            values = (
+                softplus(load(features, start, vector_zero()) + density_of.shift, vector_zero())
+                * density_of.scale
+            )
             store(features, start, values)
             for q in range(start, stop):
                 if depth > density_of.limit:

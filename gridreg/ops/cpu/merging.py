@@ -10,16 +10,9 @@ from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
 from gridreg.ops import merging as ops
-from gridreg.ops.cpu.jit.compiler import (
-    Matrix,
-    Vector,
-    float32,
-    float64,
-    inline,
-    int64,
-    kernel,
-)
+from gridreg.ops.cpu.jit.compiler import inline, kernel
 from gridreg.ops.cpu.jit.launch import launch
+from gridreg.ops.cpu.jit.table import Matrix, Vector, float32, float64, int64
 
 __all__ = ["merge_samples", "spread_to_samples"]
 

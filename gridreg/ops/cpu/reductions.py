@@ -7,19 +7,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gridreg.ops.cpu.jit.bfloat16 import get
-from gridreg.ops.cpu.jit.compiler import (
-    Matrix,
-    Vector,
-    float32,
-    float64,
-    inline,
-    int32,
-    int64,
-    kernel,
-)
+from gridreg.ops.cpu.jit.compiler import inline, kernel
 from gridreg.ops.cpu.jit.launch import launch
-from gridreg.ops.cpu.jit.simd import LANES, load, one, store, wide
+from gridreg.ops.cpu.jit.simd import LANES, load, scalar_zero, store, vector_zero
+from gridreg.ops.cpu.jit.table import Matrix, Vector, float32, float64, int32, int64
 
 __all__ = ["add_rows", "reduce_sum", "round_stochastically"]
 
@@ -33,9 +24,9 @@ def add_rows(x: Any, width: Any, first: Any, count: Any, totals: Any, total: Any
     split = width - width % LANES
     for at in range(first * width, (first + count) * width, width):
         for n in range(0, split, LANES):
-            store(totals, total + n, load(totals, total + n, wide()) + get(x, at + n, wide()))
+            store(totals, total + n, load(totals, total + n, vector_zero()) + load(x, at + n, vector_zero()))
         for n in range(split, width):
-            totals[total + n] += get(x, at + n, one())
+            totals[total + n] += load(x, at + n, scalar_zero())
 
 
 @inline
@@ -54,9 +45,9 @@ def _reduce(task: int, x: Vector[float32], out: Vector[float32]) -> None:
     first, last = task * _PIECE, min((task + 1) * _PIECE, stride)
     split = last - (last - first) % LANES
     for i in range(first, split, LANES):
-        _reduce_step(x, out, i, parts, stride, wide())
+        _reduce_step(x, out, i, parts, stride, vector_zero())
     for i in range(split, last):
-        _reduce_step(x, out, i, parts, stride, one())
+        _reduce_step(x, out, i, parts, stride, scalar_zero())
 
 
 def reduce_sum(parts: Tensor) -> Tensor:

@@ -18,21 +18,10 @@ from gridreg.ops.cpu.interpolation import (
     lookahead,
     prefetch_cell,
 )
-from gridreg.ops.cpu.jit.bfloat16 import put
-from gridreg.ops.cpu.jit.compiler import (
-    Cube,
-    Matrix,
-    Vector,
-    float32,
-    inline,
-    int32,
-    int64,
-    kernel,
-    scratch,
-    uint16,
-)  # fmt: skip
+from gridreg.ops.cpu.jit.compiler import inline, kernel
 from gridreg.ops.cpu.jit.launch import launch
-from gridreg.ops.cpu.jit.simd import LANES, one, total, wide
+from gridreg.ops.cpu.jit.simd import LANES, scalar_zero, store, total, vector_zero
+from gridreg.ops.cpu.jit.table import Cube, Matrix, Vector, float32, int32, int64, scratch, uint16
 
 __all__ = ["Batch", "density", "features", "find_cells", "look_up", "shape_of"]
 
@@ -60,12 +49,12 @@ def _product(plane: Any, line: Any, cell: Any, segment: Any, c: int, dtype_like:
 def _sum(plane: Any, line: Any, cell: Any, segment: Any, read: int) -> Any:
     """Sum over channels of plane times line."""
     blocks = read - read % LANES
-    lanes = wide()
+    lanes = vector_zero()
     for c in range(0, blocks, LANES):
-        lanes = lanes + _product(plane, line, cell, segment, c, wide())
+        lanes = lanes + _product(plane, line, cell, segment, c, vector_zero())
     value = total(lanes)
     for c in range(blocks, read):
-        value += _product(plane, line, cell, segment, c, one())
+        value += _product(plane, line, cell, segment, c, scalar_zero())
     return value
 
 
@@ -74,11 +63,11 @@ def _write(plane: Any, line: Any, cell: Any, segment: Any, read: int, out: Any, 
     """Plane times line to ``out`` from element ``to`` on; 0 for channels that are not read."""
     blocks = read - read % LANES
     for c in range(0, blocks, LANES):
-        put(out, to + c, _product(plane, line, cell, segment, c, wide()))
+        store(out, to + c, _product(plane, line, cell, segment, c, vector_zero()))
     for c in range(blocks, read):
-        put(out, to + c, _product(plane, line, cell, segment, c, one()))
+        store(out, to + c, _product(plane, line, cell, segment, c, scalar_zero()))
     for c in range(read, cell.across):
-        put(out, to + c, one())
+        store(out, to + c, scalar_zero())
 
 
 @inline

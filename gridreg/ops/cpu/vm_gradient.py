@@ -23,21 +23,10 @@ from gridreg.ops.cpu.interpolation import (
     prefetch_cell,
     prefetch_row,
 )  # fmt: skip
-from gridreg.ops.cpu.jit.bfloat16 import get
-from gridreg.ops.cpu.jit.compiler import (
-    Cube,
-    Kernel,
-    Matrix,
-    Vector,
-    float32,
-    inline,
-    int32,
-    int64,
-    kernel,
-    uint16,
-)
+from gridreg.ops.cpu.jit.compiler import Kernel, inline, kernel
 from gridreg.ops.cpu.jit.launch import launch
-from gridreg.ops.cpu.jit.simd import LANES, load, one, store, wide
+from gridreg.ops.cpu.jit.simd import LANES, load, scalar_zero, store, vector_zero
+from gridreg.ops.cpu.jit.table import Cube, Matrix, Vector, float32, int32, int64, uint16
 from gridreg.ops.cpu.jit.workspace import workspace
 from gridreg.ops.cpu.reductions import reduce_sum
 
@@ -141,12 +130,21 @@ def _add_entries(
                 cell,
                 segment,
                 c,
-                wide() + g if summed else get(upstream, n + c, wide()),
+                vector_zero() + g if summed else load(upstream, n + c, vector_zero()),
                 to,
-                wide(),
+                vector_zero(),
             )
         for c in range(blocks, read):
-            _add(plane, line, cell, segment, c, g if summed else get(upstream, n + c, one()), to, one())
+            _add(
+                plane,
+                line,
+                cell,
+                segment,
+                c,
+                g if summed else load(upstream, n + c, scalar_zero()),
+                to,
+                scalar_zero(),
+            )
 
 
 class _Grids(NamedTuple):

@@ -5,19 +5,10 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from gridreg.ops.cpu.adam.layout import FLAT, PIECE
-from gridreg.ops.cpu.jit.compiler import (
-    Matrix,
-    Table,
-    Vector,
-    float32,
-    float64,
-    inline,
-    int64,
-    kernel,
-    vector,
-)  # fmt: skip
-from gridreg.ops.cpu.jit.simd import LANES, load, one, store, total, wide
+from gridreg.ops.cpu.jit.compiler import inline, kernel
+from gridreg.ops.cpu.jit.simd import LANES, load, scalar_zero, store, total, vector_zero
 from gridreg.ops.cpu.jit.simd_math import divide, flush, magnitude, sign, square_root
+from gridreg.ops.cpu.jit.table import Matrix, Table, Vector, float32, float64, int64, vector
 from gridreg.ops.fused_adam import Moments
 
 __all__ = ["Factors", "flat_step", "grid_step", "keep_edges"]
@@ -69,13 +60,17 @@ def _differences(
     for first in range(0, count, PIECE):
         last = min(first + PIECE, count)
         split = last - (last - first) % LANES
-        a0, a1 = wide(), wide()
+        a0, a1 = vector_zero(), vector_zero()
         for i in range(first, split, LANES):
-            b0, b1 = _difference_step(p, g, low, below + i, high, above + i, at + i, left, right, k, wide())
+            b0, b1 = _difference_step(
+                p, g, low, below + i, high, above + i, at + i, left, right, k, vector_zero()
+            )
             a0, a1 = a0 + b0, a1 + b1
         c0, c1 = total(a0), total(a1)
         for i in range(split, last):
-            d0, d1 = _difference_step(p, g, low, below + i, high, above + i, at + i, left, right, k, one())
+            d0, d1 = _difference_step(
+                p, g, low, below + i, high, above + i, at + i, left, right, k, scalar_zero()
+            )
             c0, c1 = c0 + d0, c1 + d1
         sums[0] += c0
         sums[1] += c1
@@ -131,13 +126,13 @@ def _steps(p: Any, g: Any, m: Any, v: Any, begin: int, end: int, s: Any, k: Any,
     for first in range(begin, end, PIECE):
         last = min(first + PIECE, end)
         split = last - (last - first) % LANES
-        sizes, squares = wide(), wide()
+        sizes, squares = vector_zero(), vector_zero()
         for i in range(first, split, LANES):
-            size, square = _step(p, g, m, v, i, wide(), s, k)
+            size, square = _step(p, g, m, v, i, vector_zero(), s, k)
             sizes, squares = sizes + size, squares + square
         size_sum, square_sum = total(sizes), total(squares)
         for i in range(split, last):
-            size, square = _step(p, g, m, v, i, one(), s, k)
+            size, square = _step(p, g, m, v, i, scalar_zero(), s, k)
             size_sum, square_sum = size_sum + size, square_sum + square
         sums[2] += size_sum
         sums[3] += square_sum
@@ -147,9 +142,14 @@ def _steps(p: Any, g: Any, m: Any, v: Any, begin: int, end: int, s: Any, k: Any,
 def _idle(g: Any, m: Any, v: Any, first: int, last: int) -> Any:
     """Whether a step without local terms would leave all as it is."""
     split = last - (last - first) % LANES
-    sizes = wide()
+    sizes = vector_zero()
     for i in range(first, split, LANES):
-        sizes = sizes + magnitude(load(g, i, wide())) + magnitude(load(m, i, wide())) + load(v, i, wide())
+        sizes = (
+            sizes
+            + magnitude(load(g, i, vector_zero()))
+            + magnitude(load(m, i, vector_zero()))
+            + load(v, i, vector_zero())
+        )
     size = total(sizes)
     for i in range(split, last):
         size += abs(g[i]) + abs(m[i]) + v[i]
@@ -201,8 +201,8 @@ def keep_edges(
     at, slab, to = parts[task, 1], parts[task, 2], parts[task, 3]
     split = slab - slab % LANES
     for i in range(0, split, LANES):
-        store(before, to + i, load(p, at - slab + i, wide()))
-        store(after, to + i, load(p, at + i, wide()))
+        store(before, to + i, load(p, at - slab + i, vector_zero()))
+        store(after, to + i, load(p, at + i, vector_zero()))
     for i in range(split, slab):
         before[to + i] = p[at - slab + i]
         after[to + i] = p[at + i]

@@ -26,64 +26,25 @@ import threading
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeAlias, TypeVar
+from typing import Any
 
-import numpy as np
-from llvmlite import ir  # type: ignore[import-untyped]
-from numba import cfunc, extending, njit, types
+from numba import cfunc, njit, types
 from numba.core.caching import FunctionCache
 from numba.core.errors import NumbaWarning
-from numba.np import arrayobj
-from numpy import float32, float64, int32, int64, uint8, uint16
 
 from gridreg.ops.cpu.jit.cache import can_lock, forget_outdated, one_process
+from gridreg.ops.cpu.jit.table import TABLE, cube, integer, matrix, next_task, real, vector
 
-__all__ = [
-    "Cube",
-    "Kernel",
-    "Matrix",
-    "Table",
-    "Vector",
-    "cube",
-    "exact",
-    "float32",
-    "float64",
-    "inline",
-    "int32",
-    "int64",
-    "integer",
-    "intrinsic",
-    "kernel",
-    "matrix",
-    "next_task",
-    "real",
-    "scratch",
-    "size",
-    "uint16",
-    "uint8",
-    "vector",
-]
-
-_T = TypeVar("_T", bound=np.generic)
-# Tensors as kernels see them: all elements in one row, or two or three axes.
-Vector: TypeAlias = np.ndarray[Any, np.dtype[_T]]
-Matrix: TypeAlias = np.ndarray[Any, np.dtype[_T]]
-Cube: TypeAlias = np.ndarray[Any, np.dtype[_T]]
-Table: TypeAlias = Any
+__all__ = ["Kernel", "exact", "inline", "kernel"]
 
 # Reordering and contraction make sums fast; not-a-number and infinity keep their meaning, as a run must see them.
 _FAST = {"contract", "nsz", "arcp", "reassoc"}
 _OPTIONS: dict[str, Any] = {"error_model": "numpy", "boundscheck": False}
 # Only kernels are called from outside.
 _HELPER: dict[str, Any] = {**_OPTIONS, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-_TABLE = types.CPointer(types.int64)  # type: ignore[no-untyped-call]
-_WORD = ir.IntType(64)
 _COMPILING = threading.Lock()
 # The package whose kernels a second process knows.
 _OPERATIONS = "gridreg.ops."
-
-# Untyped: a call from a kernel has fewer arguments than the function that generates it.
-intrinsic: Any = extending.intrinsic
 
 
 class Kernel:
@@ -127,7 +88,7 @@ class Kernel:
         return (Path(folder) / f"{self.name}.lock").exists()
 
     def _compile(self) -> Any:
-        compiled: Any = functools.partial(cfunc, types.void(_TABLE), fastmath=_FAST, **_OPTIONS)
+        compiled: Any = functools.partial(cfunc, types.void(TABLE), fastmath=_FAST, **_OPTIONS)
         serving = _serving(self.function)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NumbaWarning)
@@ -207,113 +168,3 @@ def inline(function: Callable[..., Any]) -> Any:
 def exact(function: Callable[..., Any]) -> Any:
     """Like `inline`, with every operation rounded on its own, in the order written."""
     return njit(fastmath=False, **_HELPER)(function)
-
-
-def _word(builder: Any, table: Any, place: Any, offset: int) -> Any:
-    """Word ``offset`` of argument ``place``."""
-    at = builder.add(builder.mul(place, _WORD(4)), _WORD(2 + offset))
-    return builder.load(builder.gep(table, [at]))
-
-
-def _place(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    return context.cast(builder, arguments[1], signature.args[1], types.int64)
-
-
-@intrinsic
-def next_task(context: Any, table: Any) -> Any:
-    """``next_task(table)``: number of a task that no other thread has, or -1 when all are taken."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        task = builder.atomic_rmw("add", arguments[0], _WORD(1), "monotonic")
-        tasks = builder.load(builder.gep(arguments[0], [_WORD(1)]))
-        return builder.select(builder.icmp_signed("<", task, tasks), task, _WORD(-1))
-
-    return types.int64(_TABLE), generate
-
-
-@intrinsic
-def size(context: Any, table: Any, place: Any, axis: Any) -> Any:
-    """``size(table, place, axis)``: length of a tensor along an axis; 1 for an axis that it does not have."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        axis = context.cast(builder, arguments[2], signature.args[2], types.int64)
-        at = builder.mul(_place(context, builder, signature, arguments), _WORD(4))
-        return builder.load(builder.gep(arguments[0], [builder.add(builder.add(at, axis), _WORD(3))]))
-
-    return types.int64(_TABLE, place, axis), generate
-
-
-@intrinsic
-def integer(context: Any, table: Any, place: Any) -> Any:
-    """``integer(table, place)``: an integer."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return _word(builder, arguments[0], _place(context, builder, signature, arguments), 0)
-
-    return types.int64(_TABLE, place), generate
-
-
-@intrinsic
-def real(context: Any, table: Any, place: Any) -> Any:
-    """``real(table, place)``: a number, as float32."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        bits = _word(builder, arguments[0], _place(context, builder, signature, arguments), 0)
-        return builder.fptrunc(builder.bitcast(bits, ir.DoubleType()), ir.FloatType())
-
-    return types.float32(_TABLE, place), generate
-
-
-def _wrap(context: Any, builder: Any, kind: Any, data: Any, shape: list[Any]) -> Any:
-    """An array of type ``kind`` around memory."""
-    array = arrayobj.make_array(kind)(context, builder)  # type: ignore[no-untyped-call]
-    itemsize = context.get_constant(types.intp, context.get_abi_sizeof(context.get_data_type(kind.dtype)))
-    strides = [itemsize]
-    for length in reversed(shape[1:]):
-        strides.insert(0, builder.mul(length, strides[0]))
-    data = builder.bitcast(data, array.data.type)
-    arrayobj.populate_array(  # type: ignore[no-untyped-call]
-        array, data=data, shape=shape, strides=strides, itemsize=itemsize, meminfo=None
-    )
-    return array._getvalue()
-
-
-def _tensor(axes: int, name: str, text: str) -> Any:
-    def typed(context: Any, table: Any, place: Any, dtype: Any) -> Any:
-        kind = types.Array(dtype.dtype, axes, "C")
-
-        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            place = _place(context, builder, signature, arguments)
-            data = builder.inttoptr(_word(builder, arguments[0], place, 0), ir.IntType(8).as_pointer())
-            lengths = [_word(builder, arguments[0], place, 1 + axis) for axis in range(3)]
-            # What a tensor has in more axes than asked for belongs to the last.
-            shape = [*lengths[: axes - 1], functools.reduce(builder.mul, lengths[axes - 1 :])]
-            return _wrap(context, builder, kind, data, shape)
-
-        return kind(_TABLE, place, dtype), generate
-
-    typed.__name__, typed.__doc__ = name, text
-    return intrinsic(typed)
-
-
-vector = _tensor(1, "vector", "``vector(table, place, dtype)``: a tensor as ``(N,)``, all of its elements.")
-matrix = _tensor(2, "matrix", "``matrix(table, place, dtype)``: a tensor of two axes.")
-cube = _tensor(3, "cube", "``cube(table, place, dtype)``: a tensor of three axes.")
-
-
-@intrinsic(prefer_literal=True)
-def scratch(context: Any, length: Any, dtype: Any) -> Any:
-    """``scratch(length, dtype)``: memory of a constant length on the stack; only for the function that asks for it."""
-    if not isinstance(length, types.IntegerLiteral):
-        return None
-    kind = types.Array(dtype.dtype, 1, "C")
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        count = signature.args[0].literal_value
-        block = ir.ArrayType(context.get_data_type(kind.dtype), count)
-        # numba's own `alloca_once` also writes zeros, element by element: code of the length of the memory.
-        with builder.goto_entry_block():
-            memory = builder.alloca(block)
-        return _wrap(context, builder, kind, memory, [context.get_constant(types.intp, count)])
-
-    return kind(length, dtype), generate

@@ -1,15 +1,17 @@
-"""Vectors of float32 channels for kernels.
+"""Vectors of float32 channels for kernels, in memory float32 or bfloat16.
 
 A loop over a channel count known only at run time is compiled to scalar code for short rows, and LLVM cannot prove
 that the gradient rows that a kernel updates do not overlap. So the channel loops say themselves what a vector is:
-`wide` and `one` give samples of the two types of a channel step, eight float32 or a single one, and
-``load(x, i, like)`` gives what ``like`` is. Written once, a loop body serves the blocks of eight and the rest::
+`vector_zero` and `scalar_zero` give samples of the two types of a channel step, eight float32 or a single one, and
+``load(x, i, dtype_like)`` gives what ``dtype_like`` is. Written once, a loop body serves the blocks of eight and the
+rest::
 
-    for c in range(0, blocks, LANES): body(c, wide())
-    for c in range(blocks, channels): body(c, one())
+    for c in range(0, blocks, LANES): body(c, vector_zero())
+    for c in range(blocks, channels): body(c, scalar_zero())
 
 ``+``, ``-`` and ``*`` work on eight lanes at once, also with a float32 on either side, and contract to fused
-multiply-adds. LLVM maps eight lanes to whatever the processor has (one AVX register, two NEON ones, ...).
+multiply-adds. LLVM maps eight lanes to whatever the processor has (one AVX register, two NEON ones, ...). An array of
+uint16 holds bfloat16, the upper halves of float32: they are widened and rounded on the way.
 """
 
 from __future__ import annotations
@@ -23,9 +25,9 @@ from numba.core.imputils import lower_builtin
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import models, register_model
 
-from gridreg.ops.cpu.jit.compiler import inline, intrinsic
+from gridreg.ops.cpu.jit.table import intrinsic
 
-__all__ = ["LANES", "add_to", "load", "one", "prefetch", "store", "total", "wide"]
+__all__ = ["LANES", "load", "prefetch", "bf16_bits", "scalar_zero", "store", "total", "vector_zero"]
 
 LANES = 8
 _FLAGS = ("contract", "nsz", "arcp", "reassoc")
@@ -50,14 +52,10 @@ class _LanesModel(models.PrimitiveModel):  # type: ignore[misc]
 
 
 def _element(context: Any, builder: Any, signature: Any, arguments: Any, pointee: Any) -> Any:
-    """Pointer to element ``arguments[1]`` of the contiguous 1-D array ``arguments[0]``."""
+    """Pointer to element ``arguments[1]``, in the order of memory, of the contiguous array ``arguments[0]``."""
     array = context.make_array(signature.args[0])(context, builder, arguments[0])
     index = context.cast(builder, arguments[1], signature.args[1], types.int64)
     return builder.bitcast(builder.gep(array.data, [index]), pointee.as_pointer())
-
-
-def _width(like: Any) -> Any:
-    return _LLVM if isinstance(like, _Lanes) else ir.FloatType()
 
 
 def _splat(builder: Any, value: Any) -> Any:
@@ -67,23 +65,55 @@ def _splat(builder: Any, value: Any) -> Any:
     return builder.shuffle_vector(builder.insert_element(undefined, value, _INDEX(0)), undefined, mask)
 
 
+def _integers(kind: Any) -> tuple[Any, Any]:
+    """int32 and int16 with as many lanes as a type of float32."""
+    word, half = ir.IntType(32), ir.IntType(16)
+    if isinstance(kind, ir.VectorType):
+        return ir.VectorType(word, kind.count), ir.VectorType(half, kind.count)
+    return word, half
+
+
+def _constant(kind: Any, value: int) -> Any:
+    return ir.Constant(kind, [value] * kind.count if isinstance(kind, ir.VectorType) else value)
+
+
+def bf16_bits(builder: Any, value: Any) -> Any:
+    """Write instructions: bits of float32 rounded to the nearest bfloat16, ties to even; NaN stays NaN."""
+    word, half = _integers(value.type)
+    bits = builder.bitcast(value, word)
+    upper = builder.lshr(bits, _constant(word, 16))
+    even = builder.and_(upper, _constant(word, 1))
+    nearest = builder.lshr(builder.add(bits, builder.add(even, _constant(word, 0x7FFF))), _constant(word, 16))
+    # Rounding would carry the payload of a NaN over into infinity or zero.
+    hidden = builder.fcmp_unordered("uno", value, value)
+    return builder.trunc(builder.select(hidden, builder.or_(upper, _constant(word, 0x40)), nearest), half)
+
+
 @intrinsic
-def load(context: Any, array: Any, index: Any, like: Any) -> Any:
-    """``load(x, i, like)``: elements from ``i`` on of the 1-D array ``x``, as many as ``like`` has."""
+def load(context: Any, array: Any, index: Any, dtype_like: Any) -> Any:
+    """``load(x, i, dtype_like)``: elements from ``i`` on as float32, as many as ``dtype_like`` has."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.load(_element(context, builder, signature, arguments, _width(like)), align=4)
+        real = _LLVM if isinstance(dtype_like, _Lanes) else ir.FloatType()
+        if array.dtype != types.uint16:
+            return builder.load(_element(context, builder, signature, arguments, real), align=4)
+        word, half = _integers(real)
+        bits = builder.load(_element(context, builder, signature, arguments, half), align=2)
+        return builder.bitcast(builder.shl(builder.zext(bits, word), _constant(word, 16)), real)
 
-    return like(array, index, like), generate
+    return dtype_like(array, index, dtype_like), generate
 
 
 @intrinsic
 def store(context: Any, array: Any, index: Any, value: Any) -> Any:
-    """``store(x, i, value)``: write to the elements from ``i`` on of the 1-D array ``x``."""
+    """``store(x, i, value)``: write float32 to the elements from ``i`` on."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        pointer = _element(context, builder, signature, arguments, _width(value))
-        builder.store(arguments[2], pointer, align=4)
+        low = array.dtype == types.uint16
+        found = bf16_bits(builder, arguments[2]) if low else arguments[2]
+        builder.store(
+            found, _element(context, builder, signature, arguments, found.type), align=2 if low else 4
+        )
         return context.get_dummy_value()
 
     return types.void(array, index, value), generate
@@ -91,7 +121,7 @@ def store(context: Any, array: Any, index: Any, value: Any) -> Any:
 
 @intrinsic
 def prefetch(context: Any, array: Any, index: Any) -> Any:
-    """``prefetch(x, i)``: ask for the cache line of element ``i`` of the 1-D array ``x``."""
+    """``prefetch(x, i)``: ask for the cache line of element ``i``."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         pointer = _element(context, builder, signature, arguments, ir.IntType(8))
@@ -104,8 +134,8 @@ def prefetch(context: Any, array: Any, index: Any) -> Any:
 
 
 @intrinsic
-def wide(context: Any) -> Any:
-    """``wide()``: eight zeros."""
+def vector_zero(context: Any) -> Any:
+    """``vector_zero()``: eight zeros."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return ir.Constant(_LLVM, [0.0] * LANES)
@@ -114,8 +144,8 @@ def wide(context: Any) -> Any:
 
 
 @intrinsic
-def one(context: Any) -> Any:
-    """``one()``: a single zero."""
+def scalar_zero(context: Any) -> Any:
+    """``scalar_zero()``: a single zero."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return ir.Constant(ir.FloatType(), 0.0)
@@ -170,9 +200,3 @@ def _define(symbol: Any, instruction: str) -> None:
 _define(operator.add, "fadd")
 _define(operator.sub, "fsub")
 _define(operator.mul, "fmul")
-
-
-@inline
-def add_to(x: Any, i: Any, value: Any) -> Any:
-    """Add ``value`` to the elements from ``i`` on of the 1-D array ``x``."""
-    store(x, i, load(x, i, value) + value)

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from gridreg.ops.cpu.jit.bfloat16 import get, put
-from gridreg.ops.cpu.jit.compiler import float32, inline, int64, integer, vector
-from gridreg.ops.cpu.jit.simd import LANES, load, one, store, wide
-from gridreg.ops.cpu.jit.sincos import sine_and_cosine
+from gridreg.ops.cpu.jit.compiler import inline
+from gridreg.ops.cpu.jit.simd import LANES, load, scalar_zero, store, vector_zero
+from gridreg.ops.cpu.jit.simd_math import sine_and_cosine
+from gridreg.ops.cpu.jit.table import float32, int64, integer, vector
 
 __all__ = ["MOST_OCTAVES", "PER_BLOCK", "copy_rows", "decode_rows", "encode_rows"]
 
@@ -28,11 +28,11 @@ def copy_rows(x: Any, width: int, first: int, rows: int, out: Any, out_first: in
     for r in range(rows):
         source, to = (first + r) * width, (out_first + r) * out_width
         for i in range(0, split, LANES):
-            put(out, to + i, get(x, source + i, wide()))
+            store(out, to + i, load(x, source + i, vector_zero()))
         for i in range(split, width):
-            put(out, to + i, get(x, source + i, one()))
+            store(out, to + i, load(x, source + i, scalar_zero()))
         for i in range(width, out_width):
-            put(out, to + i, one())
+            store(out, to + i, scalar_zero())
 
 
 @inline
@@ -70,7 +70,7 @@ def encode_rows(
             source, to = (row_of[n] if by_row else n) * dims, n * width + start
             # From the last vector on, as what a vector is too wide belongs to places that are written later.
             for i in range((dims - 1) // LANES * LANES, -1, -LANES):
-                value = load(x, source + i, wide())
+                value = load(x, source + i, vector_zero())
                 sine, cosine = value, value
                 if octaves > 0:
                     sine, cosine = sine_and_cosine(value)
@@ -83,16 +83,17 @@ def encode_rows(
 
 @inline
 def _read_octaves(
-    x: Any, start: int, gradient: Any, gradient_start: int, result: Any, to: int, dims: int, octaves: int, like: Any
+    x: Any, start: int, gradient: Any, gradient_start: int, result: Any, to: int, dims: int, octaves: int,
+    dtype_like: Any,
 ) -> None:  # fmt: skip
     """Write ``g_x + sum over octaves of f (cos g_sin - sin g_cos)``, from encodings and their gradients."""
-    total = get(gradient, gradient_start, like)
+    total = load(gradient, gradient_start, dtype_like)
     frequency = float32(1)
     for octave in range(octaves):
         place = (1 + 2 * octave) * dims
-        sine, cosine = get(x, start + place, like), get(x, start + place + dims, like)
-        of_sine = get(gradient, gradient_start + place, like)
-        of_cosine = get(gradient, gradient_start + place + dims, like)
+        sine, cosine = load(x, start + place, dtype_like), load(x, start + place + dims, dtype_like)
+        of_sine = load(gradient, gradient_start + place, dtype_like)
+        of_cosine = load(gradient, gradient_start + place + dims, dtype_like)
         total = total + frequency * (cosine * of_sine - sine * of_cosine)
         frequency = frequency * float32(2)
     store(result, to, total)
@@ -119,6 +120,10 @@ def decode_rows(
         for r in range(rows):
             start, source, to = (first + r) * width + column, r * wider + column, (first + r) * dims
             for i in range(0, split, LANES):
-                _read_octaves(encoded, start + i, gradient, source + i, result, to + i, dims, octaves, wide())
+                _read_octaves(
+                    encoded, start + i, gradient, source + i, result, to + i, dims, octaves, vector_zero()
+                )
             for i in range(split, dims):
-                _read_octaves(encoded, start + i, gradient, source + i, result, to + i, dims, octaves, one())
+                _read_octaves(
+                    encoded, start + i, gradient, source + i, result, to + i, dims, octaves, scalar_zero()
+                )

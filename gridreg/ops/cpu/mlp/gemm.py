@@ -10,7 +10,8 @@ from numba import types
 from torch import Tensor
 from torch.nn import functional as F
 
-from gridreg.ops.cpu.jit.compiler import inline, intrinsic
+from gridreg.ops.cpu.jit.compiler import inline
+from gridreg.ops.cpu.jit.table import intrinsic
 from gridreg.ops.cpu.mlp.gemm_tile import (
     BF16,
     COLUMNS,

@@ -17,8 +17,8 @@ from llvmlite import binding, ir  # type: ignore[import-untyped]
 from numba import config, types
 from numba.core import cgutils
 
-from gridreg.ops.cpu.jit.bfloat16 import rounded
-from gridreg.ops.cpu.jit.compiler import intrinsic
+from gridreg.ops.cpu.jit.simd import bf16_bits
+from gridreg.ops.cpu.jit.table import intrinsic
 
 __all__ = [
     "BF16",
@@ -138,7 +138,7 @@ def element(builder: Any, pointer: Any, index: Any, like: Any = _FLOATS) -> Any:
 def round_lanes(builder: Any, value: Any) -> Any:
     """Eight or sixteen float32 rounded to bfloat16; subnormal numbers become 0 where the processor does it."""
     if not _NATIVE:
-        return rounded(builder, value)
+        return bf16_bits(builder, value)
     lanes = value.type.count
     kind = ir.FunctionType(ir.VectorType(_BFloat(), lanes), [value.type])
     name = f"llvm.x86.avx512bf16.cvtneps2bf16.{32 * lanes}"

@@ -10,19 +10,9 @@ from typing import Any, NamedTuple
 from numba import njit
 from torch import Tensor
 
-from gridreg.ops.cpu.jit.compiler import (
-    float32,
-    int32,
-    int64,
-    integer,
-    kernel,
-    next_task,
-    scratch,
-    size,
-    uint16,
-    vector,
-)
+from gridreg.ops.cpu.jit.compiler import kernel
 from gridreg.ops.cpu.jit.simd import store
+from gridreg.ops.cpu.jit.table import float32, int32, int64, integer, next_task, scratch, size, uint16, vector
 from gridreg.ops.cpu.mlp.encodings import PER_BLOCK, copy_rows, decode_rows, encode_rows
 from gridreg.ops.cpu.mlp.gemm import (
     GRADIENT_ROWS,
