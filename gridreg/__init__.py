@@ -15,17 +15,24 @@ from gridreg.errors import RENAMED, InputError
 from gridreg.regularizers.backgrounds import (
     ExpectedBackground,
     RandomBackground,
-    SampleSpaceAnnealing,
-    anneal_space,
     opacity_error,
     random_background,
 )
 from gridreg.regularizers.channel_masks import CosineMask, FixedMask, FrequencyMask
-from gridreg.regularizers.density import CauchySparsity, OcclusionLoss, cauchy_sparsity, occlusion_loss
+from gridreg.regularizers.density import (
+    CauchySparsity,
+    Eikonal,
+    OcclusionLoss,
+    cauchy_sparsity,
+    eikonal,
+    occlusion_loss,
+)
+from gridreg.regularizers.depth_prior import DepthPrior, depth_correlation, depth_ranking, depth_residual
 from gridreg.regularizers.dropout import ComponentDropout, component_dropout
 from gridreg.regularizers.filters import fourier_low_pass, gaussian_blur
+from gridreg.regularizers.functions import GridFunction, SamplesFunction, from_function
 from gridreg.regularizers.gradient_scaling import DistanceGradientScaling, scale_gradients_by_distance
-from gridreg.regularizers.grids import L1, Orthogonality, TotalVariation, l1, orthogonality, total_variation
+from gridreg.regularizers.grids import L1, L2, Orthogonality, l1, l2, orthogonality
 from gridreg.regularizers.level_masks import LevelMask, ViewDependenceMask
 from gridreg.regularizers.low_pass import FourierLowPass, GridBlur, annealed_radius
 from gridreg.regularizers.mask_base import Mask
@@ -39,7 +46,15 @@ from gridreg.regularizers.mask_functions import (
     spherical_bands,
 )
 from gridreg.regularizers.optimizer import LearningRate, WeightDecay, split_groups
-from gridreg.regularizers.patches import DepthSmoothness, RayKL, depth_smoothness, ray_kl
+from gridreg.regularizers.patches import (
+    DepthSmoothness,
+    NormalSmoothness,
+    RayKL,
+    depth_smoothness,
+    normal_smoothness,
+    ray_kl,
+)
+from gridreg.regularizers.proposals import ProposalLoss, proposal_loss
 from gridreg.regularizers.rays import (
     DistortionLoss,
     OpacityEntropy,
@@ -48,6 +63,8 @@ from gridreg.regularizers.rays import (
     opacity_entropy,
     ray_entropy,
 )
+from gridreg.regularizers.sample_space import SampleSpaceAnnealing, anneal_space
+from gridreg.regularizers.smoothness import TimeSmoothness, TotalVariation, time_smoothness, total_variation
 from gridreg.samples import RaySamples
 from gridreg.schedules import (
     Cosine,
@@ -68,23 +85,29 @@ __all__ = [
     "Context",
     "Cosine",
     "CosineMask",
+    "DepthPrior",
     "DepthSmoothness",
     "DistanceGradientScaling",
     "DistortionLoss",
+    "Eikonal",
     "ExpectedBackground",
     "FixedMask",
     "FourierLowPass",
     "FrequencyMask",
     "Geometric",
     "Grid",
+    "GridBlur",
+    "GridFunction",
     "Handle",
     "InputError",
     "L1",
+    "L2",
     "LearningRate",
     "LevelMask",
     "Linear",
     "LocalTerm",
     "Mask",
+    "NormalSmoothness",
     "Numeric",
     "OcclusionLoss",
     "OpacityEntropy",
@@ -92,17 +115,19 @@ __all__ = [
     "Piecewise",
     "Place",
     "PositionalEncoding",
+    "ProposalLoss",
     "REGISTRY",
     "RandomBackground",
     "RayEntropy",
     "RayKL",
     "RaySamples",
     "Regularizer",
+    "SampleSpaceAnnealing",
+    "SamplesFunction",
     "Schedule",
     "Selector",
     "Site",
-    "SampleSpaceAnnealing",
-    "GridBlur",
+    "TimeSmoothness",
     "TotalVariation",
     "ViewDependenceMask",
     "WeightDecay",
@@ -115,16 +140,23 @@ __all__ = [
     "composition",
     "composition_names",
     "cosine_mask",
+    "depth_correlation",
+    "depth_ranking",
+    "depth_residual",
     "depth_smoothness",
     "distortion",
+    "eikonal",
     "fixed_mask",
     "fourier_low_pass",
     "frequency_mask",
     "from_config",
+    "from_function",
     "gaussian_blur",
     "inputs",
     "l1",
+    "l2",
     "level_mask",
+    "normal_smoothness",
     "occlusion_loss",
     "octaves_of_channels",
     "opacity_entropy",
@@ -137,6 +169,7 @@ __all__ = [
     "parameters",
     "positional_encoding",
     "printed_frequency_mask",
+    "proposal_loss",
     "random_background",
     "ray_entropy",
     "ray_kl",
@@ -150,6 +183,7 @@ __all__ = [
     "spherical_bands",
     "split_groups",
     "strip",
+    "time_smoothness",
     "to_config",
     "total_variation",
 ]

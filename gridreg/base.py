@@ -72,6 +72,10 @@ class Context:
         """The handle's generator, on the CPU; its state is part of the handle's `state_dict`."""
         return self.clock.generator
 
+    def step_generator(self) -> torch.Generator:
+        """A generator that begins alike whenever it is asked for at one step: for penalties that draw at random."""
+        return torch.Generator().manual_seed((self.generator.initial_seed() * 1_000_003 + self.step) % 2**63)
+
     def at(
         self, value: Numeric, name: str = "value", low: float = -float("inf"), high: float = float("inf")
     ) -> float:
@@ -131,6 +135,13 @@ class Regularizer:
 
     acts_on: ClassVar[Literal["mask", "grids"]] = "mask"
     train_only: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        """Refuse at once what can be refused before the first step: a site or a weight that is none."""
+        if getattr(self, "site", None) is not None:
+            check_site(self.site)  # type: ignore[attr-defined]
+        if "weight" in self.__dataclass_fields__:
+            check_weight(self.weight)  # type: ignore[attr-defined]
 
     # --- where -------------------------------------------------------------------------------------
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -124,16 +124,70 @@ def ray_kl(alpha: Array) -> float:
     return float(np.mean((p * np.log(p / q)).sum(-1)))
 
 
+def proposal_loss(fine: Batch, coarse: Batch) -> float:
+    """mip-NeRF 360 equation 13: what exceeds the sum of the overlapping intervals of the proposal."""
+    result = []
+    for (t, delta, weights), (s, length, allowed) in zip(fine.rays(), coarse.rays(), strict=True):
+        total = 0.0
+        for i in range(len(t)):
+            a, b = t[i] - delta[i] / 2, t[i] + delta[i] / 2
+            overlap = [
+                min(b, x + d / 2) - max(a, x - d / 2) > 1e-3 * delta[i]
+                for x, d in zip(s, length, strict=True)
+            ]
+            total += max(0.0, weights[i] - allowed[np.array(overlap, dtype=bool)].sum()) ** 2 / (
+                weights[i] + 1e-7
+            )
+        result.append(total)
+    return mean(result)
+
+
+def normal_smoothness(normals: Array) -> float:
+    """The absolute differences of normals (count, height, width, 3) to the ray below and to the one on the right."""
+    count, height, width, _ = normals.shape
+    found = [
+        np.abs(normals[n, i, j] - normals[n, i + di, j + dj]).sum()
+        for n in range(count)
+        for i in range(height - 1)
+        for j in range(width - 1)
+        for di, dj in ((1, 0), (0, 1))
+    ]
+    return float(np.sum(found)) / (count * (height - 1) * (width - 1))
+
+
+def depth_correlation(depth: Array, target: Array) -> float:
+    """One less NumPy's own correlation coefficient."""
+    return 1 - float(np.corrcoef(depth, target)[0, 1])
+
+
+def depth_residual(depth: Array, target: Array) -> float:
+    """What the best straight line leaves, by NumPy's least squares."""
+    columns = np.stack([depth, np.ones_like(depth)], axis=1)
+    best = np.linalg.lstsq(columns, target, rcond=None)[0]
+    return float(np.mean((columns @ best - target) ** 2))
+
+
+def time_smoothness(values: Array, axis: int) -> float:
+    """K-Planes: squared second differences along time, one cell after another."""
+    lines = np.moveaxis(values, axis, -1).reshape(-1, values.shape[axis])
+    return mean([(v[i - 1] - 2 * v[i] + v[i + 1]) ** 2 for v in lines for i in range(1, len(v) - 1)])
+
+
 def mean(values: Array | list[float]) -> float:
     return float(np.mean(values)) if len(values) else 0.0
 
 
-def total_variation(values: Array, axes: set[int]) -> float:
-    """Sum over axes of the mean squared difference of neighbours."""
+def huber(x: float, delta: float) -> float:
+    """Huber's function: a parabola in the middle, straight lines beyond."""
+    return x * x / 2 if abs(x) <= delta else delta * (abs(x) - delta / 2)
+
+
+def total_variation(values: Array, axes: set[int], form: Callable[[float], float] = lambda x: x**2) -> float:
+    """Sum over axes of the mean squared difference of neighbours, or of another function of it."""
     total = 0.0
     for axis in axes:
         lines = np.moveaxis(values, axis, -1).reshape(-1, values.shape[axis])
-        squares = [(line[i + 1] - line[i]) ** 2 for line in lines for i in range(len(line) - 1)]
+        squares = [form(line[i + 1] - line[i]) for line in lines for i in range(len(line) - 1)]
         total += mean(squares)
     return total
 

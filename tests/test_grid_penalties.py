@@ -16,7 +16,8 @@ from torch.autograd import gradcheck
 from gridreg.attach.sites import Grid, parameters
 from gridreg.base import Clock, Context, LocalTerm
 from gridreg.errors import InputError
-from gridreg.regularizers.grids import L1, Orthogonality, TotalVariation, l1, orthogonality, total_variation
+from gridreg.regularizers.grids import L1, Orthogonality, l1, orthogonality
+from gridreg.regularizers.smoothness import TotalVariation, total_variation
 from tests import oracles
 
 CONTEXT = Context(Clock(100, seed=0))

@@ -16,12 +16,11 @@ from gridreg.errors import InputError
 from gridreg.regularizers.backgrounds import (
     ExpectedBackground,
     RandomBackground,
-    SampleSpaceAnnealing,
-    anneal_space,
     opacity_error,
     random_background,
 )
 from gridreg.regularizers.gradient_scaling import DistanceGradientScaling, scale_gradients_by_distance
+from gridreg.regularizers.sample_space import SampleSpaceAnnealing, anneal_space
 from gridreg.samples import RaySamples
 from tests.oracles import make_batch
 

@@ -93,7 +93,7 @@ def _to_plain(value: Any, where: str) -> Any:
     if isinstance(value, (tuple, list)):
         return [_to_plain(item, where) for item in value]
     hint = (
-        "use a schedule, such as gridreg.Linear, instead of a callable"
+        "use a schedule, such as gridreg.Linear, or a function at the top of a module"
         if callable(value)
         else "use plain values"
     )

@@ -1,4 +1,4 @@
-"""Backgrounds and intervals of the rays of a training step."""
+"""Backgrounds of the rays of a training step."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gridreg.attach.sites import SiteLike
-from gridreg.base import Context, Regularizer, check_weight, register
+from gridreg.base import Context, Regularizer, register
 from gridreg.errors import InputError
 from gridreg.samples import RaySamples
 from gridreg.schedules import Numeric, check_numeric
@@ -17,8 +17,6 @@ from gridreg.schedules import Numeric, check_numeric
 __all__ = [
     "ExpectedBackground",
     "RandomBackground",
-    "SampleSpaceAnnealing",
-    "anneal_space",
     "opacity_error",
     "random_background",
 ]
@@ -78,37 +76,6 @@ def opacity_error(samples: RaySamples) -> Tensor:
         raise InputError("opacity_error needs samples with target_opacity, found none")
     error = samples.opacity - torch.where(target.isnan(), samples.opacity.detach(), target)
     return error.square().sum() / max(1, samples.rays)
-
-
-def anneal_space(
-    near: Tensor, far: Tensor, progress: float, *, start: float = 0.5, middle: float = 0.5
-) -> tuple[Tensor, Tensor]:
-    """Shrink the interval of each ray about a point inside it, so that at first only the middle is sampled.
-
-    ``m + (near - m) eta`` and ``m + (far - m) eta`` with ``m = near + middle (far - near)`` and
-    ``eta = min(max(progress, start), 1)``.
-
-    Args:
-        near: ``(R,)`` distances, world units.
-        far: ``(R,)`` distances, world units.
-        progress: share of the annealing that is over; from 1 on the interval is whole.
-        start: share of the interval at the beginning, in [0, 1].
-        middle: where in the interval the point lies, in [0, 1].
-
-    Returns:
-        The new near and far; at the end the tensors themselves. Source: RegNeRF (Niemeyer et al. 2022),
-        sample space annealing.
-
-    Example:
-        >>> near, far = anneal_space(torch.tensor([2.0]), torch.tensor([6.0]), progress=0.0)
-        >>> near.item(), far.item()
-        (3.0, 5.0)
-    """
-    share = min(max(progress, start), 1.0)
-    if share == 1:
-        return near, far
-    centre = near + middle * (far - near)
-    return centre + (near - centre) * share, centre + (far - centre) * share
 
 
 @register
@@ -195,7 +162,7 @@ class ExpectedBackground(Regularizer):
 
     def __post_init__(self) -> None:
         """Refuse at once what can be refused before the first step."""
-        check_weight(self.weight)
+        super().__post_init__()
         check_numeric("until", self.until, low=0.0)
 
     def needs(self) -> tuple[str, ...]:
@@ -223,57 +190,3 @@ class ExpectedBackground(Regularizer):
     def examples(cls, site: SiteLike) -> list[Regularizer]:
         """In expectation, and stronger until half-way."""
         return [cls(), cls(weight=3.0, until=0.5)]
-
-
-@register
-@dataclass(frozen=True)
-class SampleSpaceAnnealing(Regularizer):
-    """Rays are sampled only around their middle at first, then wider: see `anneal_space`.
-
-    Args:
-        until: fraction of the run (float) or step (int) from which the whole interval is sampled; RegNeRF:
-            256 steps, 512 on some scenes.
-        start: share of the interval at the beginning, in [0, 1]; RegNeRF: 0.5.
-        middle: where in the interval the middle lies, in [0, 1]; RegNeRF: 0.5.
-
-    Formula: ``[m + (near - m) eta, m + (far - m) eta]``, ``eta = clamp(t / T, start, 1)``
-    Unit: world units
-    Source: RegNeRF (Niemeyer et al. 2022), sample space annealing
-
-    Raises:
-        InputError: a number is out of range.
-
-    Example:
-        >>> SampleSpaceAnnealing().until
-        256
-    """
-
-    until: Numeric = 256
-    start: Numeric = 0.5
-    middle: Numeric = 0.5
-
-    def __post_init__(self) -> None:
-        """Refuse at once what can be refused before the first step."""
-        check_numeric("until", self.until, low=0.0)
-        check_numeric("start", self.start, 0.0, 1.0)
-        check_numeric("middle", self.middle, 0.0, 1.0)
-
-    def near_far(self, near: Tensor, far: Tensor, context: Context) -> tuple[Tensor, Tensor]:
-        """`anneal_space` at this step."""
-        return anneal_space(
-            near,
-            far,
-            context.step / context.end(self.until),
-            start=context.at(self.start, "start", 0.0, 1.0),
-            middle=context.at(self.middle, "middle", 0.0, 1.0),
-        )
-
-    def value(self, context: Context) -> float:
-        """Share of the interval now."""
-        progress = context.step / context.end(self.until)
-        return min(max(progress, context.at(self.start, "start", 0.0, 1.0)), 1.0)
-
-    @classmethod
-    def examples(cls, site: SiteLike) -> list[Regularizer]:
-        """At its default, and about the near end."""
-        return [cls(), cls(until=0.5, start=0.1, middle=0.0)]

@@ -1,4 +1,4 @@
-"""Penalties on density at samples: occlusion and sparsity."""
+"""Penalties on density at samples, and on its derivative: occlusion, sparsity, eikonal."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import torch
 from torch import Tensor
 
 from gridreg.attach.sites import SiteLike
-from gridreg.base import Context, Regularizer, check_weight, register
+from gridreg.base import Context, Regularizer, register
 from gridreg.errors import InputError
 from gridreg.samples import RaySamples
 from gridreg.schedules import Numeric, check_numeric
 
-__all__ = ["CauchySparsity", "OcclusionLoss", "cauchy_sparsity", "occlusion_loss"]
+__all__ = ["CauchySparsity", "Eikonal", "OcclusionLoss", "cauchy_sparsity", "eikonal", "occlusion_loss"]
 
 
 def occlusion_loss(
@@ -94,6 +94,30 @@ def cauchy_sparsity(samples: RaySamples) -> Tensor:
     return torch.log1p(2 * samples.density.square()).sum()
 
 
+def eikonal(samples: RaySamples) -> Tensor:
+    """Mean over samples of ``(|g| - 1)^2``: a signed distance grows by 1 for each unit of length.
+
+    Args:
+        samples: with `gradients` of a signed distance.
+
+    Returns:
+        Scalar, no unit. Source: IGR (Gropp et al. 2020), equation 2.
+
+    Raises:
+        InputError: the samples have no gradients.
+
+    Example:
+        >>> g = torch.tensor([[[3.0, 0.0, 0.0]]])
+        >>> one = RaySamples.from_dense(torch.ones(1), torch.ones(1), torch.ones(1, 1), gradients=g)
+        >>> eikonal(one).item()
+        4.0
+    """
+    if samples.gradients is None:
+        raise InputError("eikonal needs samples with gradients, found None")
+    lengths: Tensor = torch.linalg.vector_norm(samples.gradients, dim=-1)
+    return (lengths - 1).square().sum() / max(len(samples), 1)
+
+
 @register
 @dataclass(frozen=True)
 class OcclusionLoss(Regularizer):
@@ -131,7 +155,7 @@ class OcclusionLoss(Regularizer):
 
     def __post_init__(self) -> None:
         """Refuse at once what can be refused before the first step."""
-        check_weight(self.weight)
+        super().__post_init__()
         for name in ("samples", "distance", "colour_prior", "near"):
             value = getattr(self, name)
             if value is not None:
@@ -186,13 +210,42 @@ class CauchySparsity(Regularizer):
 
     weight: Numeric = 1e-11
 
-    def __post_init__(self) -> None:
-        """Refuse at once what can be refused before the first step."""
-        check_weight(self.weight)
-
     def penalty(self, samples: RaySamples, context: Context) -> Tensor:
         """`cauchy_sparsity`."""
         return cauchy_sparsity(samples)
+
+    @classmethod
+    def examples(cls, site: SiteLike) -> list[Regularizer]:
+        """At its default."""
+        return [cls()]
+
+
+@register
+@dataclass(frozen=True)
+class Eikonal(Regularizer):
+    """The gradient of a signed distance should have length 1: see `eikonal`.
+
+    Args:
+        weight: factor of the loss; IGR, VolSDF and NeuS: 0.1.
+
+    Formula: ``mean((|g| - 1)^2)`` over samples, ``g`` the derivative of the distance by the position
+    Unit: none
+    Source: IGR (Gropp et al. 2020), equation 2
+
+    Example:
+        >>> Eikonal().needs()
+        ('gradients',)
+    """
+
+    weight: Numeric = 0.1
+
+    def needs(self) -> tuple[str, ...]:
+        """Gradients of the distance."""
+        return ("gradients",)
+
+    def penalty(self, samples: RaySamples, context: Context) -> Tensor:
+        """`eikonal`."""
+        return eikonal(samples)
 
     @classmethod
     def examples(cls, site: SiteLike) -> list[Regularizer]:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gridreg.attach.sites import SiteLike
-from gridreg.base import Context, Regularizer, check_site, register
+from gridreg.base import Context, Regularizer, register
 from gridreg.regularizers.mask_base import broadcast, remember, spread
 from gridreg.schedules import Linear, Numeric, check_numeric
 
@@ -67,7 +67,7 @@ class ComponentDropout(Regularizer):
 
     def __post_init__(self) -> None:
         """Refuse what is not a site or a probability."""
-        check_site(self.site)
+        super().__post_init__()
         check_numeric("p", self.p, 0, _HIGHEST)
 
     def prepare(self, context: Context) -> None:

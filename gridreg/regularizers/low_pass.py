@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 
 from gridreg.attach.sites import SiteLike
-from gridreg.base import Context, Regularizer, check_site, register
+from gridreg.base import Context, Regularizer, register
 from gridreg.errors import InputError
 from gridreg.regularizers.filters import Boundary, fourier_low_pass, gaussian_blur
-from gridreg.regularizers.grids import NO_NEIGHBOURS
+from gridreg.regularizers.smoothness import NO_NEIGHBOURS
 from gridreg.schedules import Linear, Numeric, check_numeric
 
 __all__ = ["FourierLowPass", "GridBlur", "annealed_radius"]
@@ -131,7 +131,7 @@ class FourierLowPass(_GridFilter):
 
     def __post_init__(self) -> None:
         """Refuse at once what can be refused before the first step."""
-        check_site(self.site)
+        super().__post_init__()
         check_numeric("keep", self.keep, 0.0, 1.0)
         if self.boundary not in ("periodic", "mirror"):
             raise InputError(f"boundary={self.boundary!r}: expected 'periodic' or 'mirror'")
@@ -192,7 +192,7 @@ class GridBlur(_GridFilter):
 
     def __post_init__(self) -> None:
         """Refuse at once what can be refused before the first step."""
-        check_site(self.site)
+        super().__post_init__()
         check_numeric("until", self.until, low=0.0)
         for name in ("start", "rounds", "rate", "floor"):
             check_numeric(name, getattr(self, name), low=0.0)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from gridreg.attach.sites import Place, SiteLike
-from gridreg.base import Context, Regularizer, check_site
+from gridreg.base import Context, Regularizer
 from gridreg.errors import InputError
 from gridreg.regularizers.mask_functions import channel_ranks
 
@@ -31,10 +31,6 @@ class Mask(Regularizer):
 
     site: SiteLike
     detach: bool = field(default=False, kw_only=True)
-
-    def __post_init__(self) -> None:
-        """Refuse what is not a site."""
-        check_site(self.site)
 
     def ranks(self, place: Place) -> tuple[int, ...]:
         """Rank of each channel, low ranks open first: by octave where known, else by index."""

@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 from torch import Tensor
 
 from gridreg.attach.sites import Grid, SiteLike
-from gridreg.base import Context, Regularizer, check_site, register
+from gridreg.base import Context, Regularizer, register
 from gridreg.errors import InputError
 from gridreg.schedules import Numeric, check_numeric
 
@@ -94,7 +94,7 @@ class WeightDecay(Regularizer):
 
     def __post_init__(self) -> None:
         """Refuse at once what can be refused before the first step."""
-        check_site(self.site)
+        super().__post_init__()
         check_numeric("decay", self.decay, low=0.0)
 
     def parameter_groups(self, groups: Groups, grids: Sequence[Grid], context: Context) -> Groups:
@@ -152,7 +152,7 @@ class LearningRate(Regularizer):
 
     def __post_init__(self) -> None:
         """Refuse at once what can be refused before the first step."""
-        check_site(self.site)
+        super().__post_init__()
         check_numeric("scale", self.scale, low=_LOWEST_SCALE)
 
     def parameter_groups(self, groups: Groups, grids: Sequence[Grid], context: Context) -> Groups:

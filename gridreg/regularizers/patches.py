@@ -1,30 +1,47 @@
-"""Penalties on neighbouring rays of image patches: smooth depth, small divergence."""
+"""Penalties on neighbouring rays of image patches: smooth depth and normals, small divergence."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 from torch import Tensor
+from torch.nn import functional as F
 
 from gridreg.attach.sites import SiteLike
-from gridreg.base import Context, Regularizer, check_weight, register
+from gridreg.base import Context, Regularizer, register
 from gridreg.errors import InputError
 from gridreg.regularizers.rays import TINY, alpha_of
 from gridreg.samples import RaySamples
 from gridreg.schedules import Geometric, Numeric
 
-__all__ = ["DepthSmoothness", "RayKL", "depth_smoothness", "ray_kl"]
+__all__ = [
+    "DepthSmoothness",
+    "NormalSmoothness",
+    "RayKL",
+    "depth_smoothness",
+    "normal_smoothness",
+    "ray_kl",
+]
 
 _REGNERF_WEIGHT = Geometric(400.0, 0.1, until=512)
 
 
-def _patches(samples: RaySamples, needed: tuple[int, int], purpose: str) -> tuple[int, int, int]:
+def _in_patches(samples: RaySamples, values: Tensor, needed: tuple[int, int], purpose: str) -> Tensor:
+    """The values ``(R, ...)`` of the rays that are patches: ``(count, height, width, ...)``."""
     if samples.patch is None or samples.patch[1] < needed[0] or samples.patch[2] < needed[1]:
         raise InputError(
             f"{purpose} needs samples.patch = (count, height, width) with patches of at least "
             f"{needed[0]}x{needed[1]} rays, found {samples.patch}"
         )
-    return samples.patch
+    count, height, width = samples.patch
+    last = values[samples.rays - count * height * width :]
+    return last.reshape(count, height, width, *values.shape[1:])
+
+
+def _steps(images: Tensor) -> tuple[Tensor, Tensor]:
+    """Differences to the neighbour below and to the one on the right, ``(count, height - 1, width - 1, ...)``."""
+    corner = images[:, :-1, :-1]
+    return corner - images[:, 1:, :-1], corner - images[:, :-1, 1:]
 
 
 def depth_smoothness(samples: RaySamples) -> Tensor:
@@ -50,10 +67,39 @@ def depth_smoothness(samples: RaySamples) -> Tensor:
         >>> depth_smoothness(samples).item()
         0.0
     """
-    count, height, width = _patches(samples, (2, 2), "DepthSmoothness")
-    depth = samples.depth[samples.rays - count * height * width :].reshape(count, height, width)
-    corner = depth[:, :-1, :-1]
-    return ((corner - depth[:, 1:, :-1]).square() + (corner - depth[:, :-1, 1:]).square()).mean()
+    down, right = _steps(_in_patches(samples, samples.depth, (2, 2), "DepthSmoothness"))
+    return (down.square() + right.square()).mean()
+
+
+def normal_smoothness(samples: RaySamples) -> Tensor:
+    """Mean absolute difference of the normal between a ray of a patch and its neighbours below and to the right.
+
+    ``mean_ij |n_ij - n_{i+1,j}|_1 + |n_ij - n_{i,j+1}|_1`` with the normal of a ray, the mean by weight of the
+    directions of its samples' gradients, at unit length.
+
+    Args:
+        samples: with `gradients`; the last rays are patches (`RaySamples.patch`).
+
+    Returns:
+        Scalar, no unit. Source: DN-Splatter (Turkulainen et al. 2024), normal smoothness; the same at points moved a
+        little: UNISURF (Oechsle et al. 2021).
+
+    Raises:
+        InputError: the samples have no gradients, no patches, or none of at least 2x2 rays.
+
+    Example:
+        >>> import torch
+        >>> g = torch.tensor([[[0.0, 0.0, 2.0]]]).expand(4, 1, 3)
+        >>> t, density = torch.ones(1), torch.ones(4, 1)
+        >>> rays = RaySamples.from_dense(t, t, density, gradients=g, patch=(1, 2, 2))
+        >>> normal_smoothness(rays).item()
+        0.0
+    """
+    if samples.gradients is None:
+        raise InputError("NormalSmoothness needs samples with gradients, found None")
+    summed = samples.sum_per_ray(samples.weights[:, None] * F.normalize(samples.gradients, dim=-1))
+    down, right = _steps(_in_patches(samples, F.normalize(summed, dim=-1), (2, 2), "NormalSmoothness"))
+    return (down.abs() + right.abs()).sum(-1).mean()
 
 
 def ray_kl(samples: RaySamples) -> Tensor:
@@ -78,9 +124,7 @@ def ray_kl(samples: RaySamples) -> Tensor:
         >>> ray_kl(two).item()
         0.0
     """
-    count, height, width = _patches(samples, (1, 2), "RayKL")
-    first = samples.rays - count * height * width
-    alpha = samples.to_dense(alpha_of(samples))[first:].reshape(count, height, width, -1)
+    alpha = _in_patches(samples, samples.to_dense(alpha_of(samples)), (1, 2), "RayKL")
     share = alpha / (alpha.sum(-1, keepdim=True) + TINY) + TINY
     ray, neighbour = share[:, :, :-1], share[:, :, 1:]
     return (ray * (ray / neighbour).log()).sum(-1).mean()
@@ -105,10 +149,6 @@ class DepthSmoothness(Regularizer):
 
     weight: Numeric = _REGNERF_WEIGHT
 
-    def __post_init__(self) -> None:
-        """Refuse at once what can be refused before the first step."""
-        check_weight(self.weight)
-
     def needs(self) -> tuple[str, ...]:
         """Patches."""
         return ("patch",)
@@ -116,6 +156,39 @@ class DepthSmoothness(Regularizer):
     def penalty(self, samples: RaySamples, context: Context) -> Tensor:
         """`depth_smoothness`."""
         return depth_smoothness(samples)
+
+    @classmethod
+    def examples(cls, site: SiteLike) -> list[Regularizer]:
+        """At its default."""
+        return [cls()]
+
+
+@register
+@dataclass(frozen=True)
+class NormalSmoothness(Regularizer):
+    """Bends between neighbouring rays of patches are penalised: see `normal_smoothness`.
+
+    Args:
+        weight: factor of the loss.
+
+    Formula: ``mean(|n_ij - n_{i+1,j}|_1 + |n_ij - n_{i,j+1}|_1)`` over patches, ``n`` the unit normal of a ray
+    Unit: none
+    Source: DN-Splatter (Turkulainen et al. 2024), normal smoothness; after UNISURF (Oechsle et al. 2021)
+
+    Example:
+        >>> NormalSmoothness().needs()
+        ('gradients', 'patch')
+    """
+
+    weight: Numeric = 0.01
+
+    def needs(self) -> tuple[str, ...]:
+        """Gradients and patches."""
+        return ("gradients", "patch")
+
+    def penalty(self, samples: RaySamples, context: Context) -> Tensor:
+        """`normal_smoothness`."""
+        return normal_smoothness(samples)
 
     @classmethod
     def examples(cls, site: SiteLike) -> list[Regularizer]:
@@ -141,10 +214,6 @@ class RayKL(Regularizer):
     """
 
     weight: Numeric = 1e-5
-
-    def __post_init__(self) -> None:
-        """Refuse at once what can be refused before the first step."""
-        check_weight(self.weight)
 
     def needs(self) -> tuple[str, ...]:
         """Patches."""

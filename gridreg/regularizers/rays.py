@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from gridreg.attach.sites import SiteLike
-from gridreg.base import Context, Regularizer, check_weight, register
+from gridreg.base import Context, Regularizer, register
 from gridreg.errors import InputError
 from gridreg.samples import RaySamples
 from gridreg.schedules import Numeric, check_numeric
@@ -170,10 +170,6 @@ class OpacityEntropy(Regularizer):
 
     weight: Numeric = 1e-3
 
-    def __post_init__(self) -> None:
-        """Refuse at once what can be refused before the first step."""
-        check_weight(self.weight)
-
     def penalty(self, samples: RaySamples, context: Context) -> Tensor:
         """`opacity_entropy`."""
         return opacity_entropy(samples)
@@ -210,7 +206,7 @@ class RayEntropy(Regularizer):
 
     def __post_init__(self) -> None:
         """Refuse at once what can be refused before the first step."""
-        check_weight(self.weight)
+        super().__post_init__()
         check_numeric("threshold", self.threshold, 0.0, 1.0)
 
     def penalty(self, samples: RaySamples, context: Context) -> Tensor:
@@ -251,7 +247,7 @@ class DistortionLoss(Regularizer):
 
     def __post_init__(self) -> None:
         """Refuse at once what can be refused before the first step."""
-        check_weight(self.weight)
+        super().__post_init__()
         _interval(self.near, self.far)
 
     def penalty(self, samples: RaySamples, context: Context) -> Tensor:

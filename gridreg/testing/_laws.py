@@ -16,7 +16,6 @@ from gridreg.base import REGISTRY, Clock, Context, LocalTerm, Regularizer, overr
 from gridreg.compositions.plain_data import from_config, to_config
 from gridreg.errors import InputError
 from gridreg.regularizers.mask_base import Mask
-from gridreg.samples import RaySamples
 from gridreg.testing import _subjects
 from gridreg.testing._mask_laws import closed_channels, masks
 from gridreg.testing._subjects import (
@@ -26,6 +25,7 @@ from gridreg.testing._subjects import (
     contexts,
     expect,
     observed,
+    rays_of,
     same,
     samples_of,
     seen,
@@ -205,17 +205,16 @@ def gradients(regularizer: Regularizer, subject: Subject) -> None:
         samples = samples_of(subject.made())
 
         def penalty(density: Tensor) -> Tensor:
-            made_from = RaySamples.from_dense(
-                torch.linspace(0.2, 2.0, 6, dtype=torch.float64),
-                torch.full((6,), 0.36, dtype=torch.float64),
-                density,
-                colours=samples.colours.detach().view(8, 6, 3).double(),  # type: ignore[union-attr]
-                positions=samples.positions.detach().view(8, 6, 3).double(),  # type: ignore[union-attr]
-                patch=(2, 2, 2),
-                target_opacity=torch.linspace(0, 1, 8),
-            )
+            # Proposals learn from final samples, which get no gradient.
+            final = fixed if "proposals" in regularizer.needs() else None
+            made_from = rays_of(density, positions, colours, directions, final)
             return regularizer.penalty(made_from, Context(clock)).double()
 
+        wide = (samples.positions, samples.colours, samples.directions)
+        positions, colours, directions = (
+            torch.zeros(8, 3) if x is None else x.detach().double().view(8, -1, 3).squeeze(1) for x in wide
+        )
+        fixed = samples.density.detach().double().view(8, 6).flip(1)
         density = samples.density.detach().double().view(8, 6).requires_grad_()
         torch.autograd.gradcheck(penalty, (density,), fast_mode=True)
     if overrides(regularizer, Regularizer.grid_penalty):

@@ -104,17 +104,29 @@ def samples_of(field: nn.Module) -> RaySamples:
     """Eight rays with six samples each, with everything that a renderer can fill in."""
     x, d = points(48)
     density, colours = field(x, d)
-    t = torch.linspace(0.2, 2.0, 6)
+    return rays_of(density.view(8, 6), x.view(8, 6, 3), colours.view(8, 6, 3), d[:8])
+
+
+def rays_of(
+    density: Tensor, positions: Tensor, colours: Tensor, directions: Tensor, final: Tensor | None = None
+) -> RaySamples:
+    """Samples of densities `(8, 6)`; those of a proposal are given a density, and the final ones `final`, if any."""
+    dtype = density.dtype
+    t, delta = torch.linspace(0.2, 2.0, 6, dtype=dtype), torch.full((6,), 0.36, dtype=dtype)
     return RaySamples.from_dense(
         t,
-        torch.full((6,), 0.36),
-        density.view(8, 6),
-        positions=x.view(8, 6, 3),
-        colours=colours.view(8, 6, 3),
-        directions=d[:8],
-        background=torch.ones(8, 3),
+        delta,
+        density if final is None else final,
+        positions=positions,
+        colours=colours,
+        gradients=density[..., None] * positions,
+        directions=directions,
+        background=torch.ones(8, 3, dtype=dtype),
         patch=(2, 2, 2),
-        target_opacity=torch.linspace(0, 1, 8),
+        target_opacity=torch.linspace(0, 1, 8, dtype=dtype),
+        target_depth=directions[:, 0],
+        images=torch.arange(8) % 2,
+        proposals=(RaySamples.from_dense(t + 0.1, delta, density.roll(1, 1)),),
     )
 
 

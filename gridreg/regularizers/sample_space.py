@@ -1,0 +1,99 @@
+"""Intervals of the rays of a training step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from gridreg.attach.sites import SiteLike
+from gridreg.base import Context, Regularizer, register
+from gridreg.schedules import Numeric, check_numeric
+
+__all__ = ["SampleSpaceAnnealing", "anneal_space"]
+
+
+def anneal_space(
+    near: Tensor, far: Tensor, progress: float, *, start: float = 0.5, middle: float = 0.5
+) -> tuple[Tensor, Tensor]:
+    """Shrink the interval of each ray about a point inside it, so that at first only the middle is sampled.
+
+    ``m + (near - m) eta`` and ``m + (far - m) eta`` with ``m = near + middle (far - near)`` and
+    ``eta = min(max(progress, start), 1)``.
+
+    Args:
+        near: ``(R,)`` distances, world units.
+        far: ``(R,)`` distances, world units.
+        progress: share of the annealing that is over; from 1 on the interval is whole.
+        start: share of the interval at the beginning, in [0, 1].
+        middle: where in the interval the point lies, in [0, 1].
+
+    Returns:
+        The new near and far; at the end the tensors themselves. Source: RegNeRF (Niemeyer et al. 2022),
+        sample space annealing.
+
+    Example:
+        >>> import torch
+        >>> near, far = anneal_space(torch.tensor([2.0]), torch.tensor([6.0]), progress=0.0)
+        >>> near.item(), far.item()
+        (3.0, 5.0)
+    """
+    share = min(max(progress, start), 1.0)
+    if share == 1:
+        return near, far
+    centre = near + middle * (far - near)
+    return centre + (near - centre) * share, centre + (far - centre) * share
+
+
+@register
+@dataclass(frozen=True)
+class SampleSpaceAnnealing(Regularizer):
+    """Rays are sampled only around their middle at first, then wider: see `anneal_space`.
+
+    Args:
+        until: fraction of the run (float) or step (int) from which the whole interval is sampled; RegNeRF:
+            256 steps, 512 on some scenes.
+        start: share of the interval at the beginning, in [0, 1]; RegNeRF: 0.5.
+        middle: where in the interval the middle lies, in [0, 1]; RegNeRF: 0.5.
+
+    Formula: ``[m + (near - m) eta, m + (far - m) eta]``, ``eta = clamp(t / T, start, 1)``
+    Unit: world units
+    Source: RegNeRF (Niemeyer et al. 2022), sample space annealing
+
+    Raises:
+        InputError: a number is out of range.
+
+    Example:
+        >>> SampleSpaceAnnealing().until
+        256
+    """
+
+    until: Numeric = 256
+    start: Numeric = 0.5
+    middle: Numeric = 0.5
+
+    def __post_init__(self) -> None:
+        """Refuse at once what can be refused before the first step."""
+        check_numeric("until", self.until, low=0.0)
+        check_numeric("start", self.start, 0.0, 1.0)
+        check_numeric("middle", self.middle, 0.0, 1.0)
+
+    def near_far(self, near: Tensor, far: Tensor, context: Context) -> tuple[Tensor, Tensor]:
+        """`anneal_space` at this step."""
+        return anneal_space(
+            near,
+            far,
+            context.step / context.end(self.until),
+            start=context.at(self.start, "start", 0.0, 1.0),
+            middle=context.at(self.middle, "middle", 0.0, 1.0),
+        )
+
+    def value(self, context: Context) -> float:
+        """Share of the interval now."""
+        progress = context.step / context.end(self.until)
+        return min(max(progress, context.at(self.start, "start", 0.0, 1.0)), 1.0)
+
+    @classmethod
+    def examples(cls, site: SiteLike) -> list[Regularizer]:
+        """At its default, and about the near end."""
+        return [cls(), cls(until=0.5, start=0.1, middle=0.0)]
