@@ -11,7 +11,8 @@ import torch
 from PIL import Image
 
 from gridreg.errors import InputError
-from gridreg.scenes import load_scene
+from gridreg.scenes import get_protocol, load_scene
+from gridreg.scenes.load import read_folder
 
 DATA = Path(os.environ.get("GRIDREG_DATA", Path(__file__).parents[2] / "shared" / "data"))
 
@@ -67,3 +68,25 @@ def test_fifty_views_of_a_body() -> None:
     scene = load_scene(folder("human/subject_b"), "human50", size=25, test=[0], validation=3)
     assert scene.train.ids == tuple(range(50))
     assert set(scene.validation.ids) <= set(range(50, 60))
+
+
+@pytest.mark.parametrize(
+    ("name", "protocol", "views"),
+    [
+        ("lego", "splatfields8", (1, 6, 15, 47, 54, 63, 69, 92)),
+        ("lego", "splatfields8-ninit10", (0, 3, 6, 8, 22, 47, 70, 96)),
+        ("chair", "splatfields8", (5, 8, 28, 36, 46, 78, 81, 87)),
+        ("chair", "splatfields8-ninit10", (8, 13, 28, 51, 71, 76, 81, 94)),
+    ],
+)
+def test_views_of_splatfields(name: str, protocol: str, views: tuple[int, ...]) -> None:
+    files = read_folder(folder(f"nerf_synthetic/{name}"))
+    positions = np.stack([frame.pose[:3, 3] for frame in files.train])
+    assert get_protocol(protocol).train.select(positions) == views
+
+
+def test_fox_from_its_own_list() -> None:
+    scene = load_scene(folder("real/fox"), "spread3", test=[0])
+    assert len(scene.train) == 3
+    assert (scene.train.width, scene.train.height) == (540, 960)
+    assert any("17 of 67 frames have no image and are left out" in note for note in scene.notes)

@@ -10,7 +10,7 @@ from scipy.cluster.vq import kmeans2
 
 from gridreg.errors import InputError
 from gridreg.scenes import PROTOCOLS, get_protocol
-from gridreg.scenes.protocols import Every, First, KMeans, Listed, Seeded
+from gridreg.scenes.protocols import Every, First, KMeans, Listed, NearestToCentres, Seeded
 
 HUNDRED = np.zeros((100, 3))
 
@@ -123,3 +123,32 @@ def test_kmeans_spreads_as_well_as_scipy_does(seed: int) -> None:
 
     best = min(spread(kmeans2(positions, 6, minit="++", rng=k)[0]) for k in range(10))
     assert spread(positions[list(KMeans(6, seed).select(positions))]) < 1.25 * best
+
+
+@pytest.mark.parametrize("restarts", [1, 10])
+@given(st.integers(4, 12), st.integers(14, 120), st.integers(0, 2**16), st.booleans())
+def test_splatfields_views_are_those_of_scikit_learn(
+    restarts: int, count: int, cameras: int, seed: int, upper: bool
+) -> None:
+    cluster = pytest.importorskip("sklearn.cluster")
+    points = np.random.default_rng(seed).normal(size=(cameras, 3))
+    points *= 4 / np.linalg.norm(points, axis=1, keepdims=True)
+    points[:, 2] = abs(points[:, 2]) if upper else points[:, 2]
+    centres = cluster.KMeans(count, n_init=restarts, random_state=0).fit(points).cluster_centers_
+    expected = sorted(int(np.linalg.norm(points - centre, axis=1).argmin()) for centre in centres)
+    assert list(NearestToCentres(count, restarts).select(points)) == expected
+
+
+def test_splatfields_and_human_by_name() -> None:
+    assert get_protocol("splatfields6").train == NearestToCentres(6, 1)
+    published = get_protocol("splatfields12-ninit10-validation")
+    assert (published.train, published.validates) == (NearestToCentres(12, 10), True)
+    assert published.test.select(np.zeros((200, 3))) == tuple(range(200))
+    assert published.halve_at is None
+    assert get_protocol("splatfields8").train.select(np.zeros((5, 3))) == tuple(range(8))
+    assert get_protocol("human4").train.select(HUNDRED) == (0, 12, 24, 36)
+    assert get_protocol("human6").train.select(HUNDRED) == (0, 8, 16, 24, 32, 40)
+    assert get_protocol("human8-validation").train == PROTOCOLS["human8"].train
+    for name in ("human0", "human8-ninit10", "splatfields", "splatfields8-ninit5"):
+        with pytest.raises(InputError, match="expected one of"):
+            get_protocol(name)

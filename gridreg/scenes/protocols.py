@@ -20,6 +20,7 @@ __all__ = [
     "First",
     "KMeans",
     "Listed",
+    "NearestToCentres",
     "Protocol",
     "Seeded",
     "Selection",
@@ -127,7 +128,67 @@ class KMeans:
         return tuple(sorted(chosen))
 
 
-Selection = Listed | Every | First | Seeded | Spread | KMeans
+@dataclass(frozen=True)
+class NearestToCentres:
+    """The frames nearest to the centres of scikit-learn's ``KMeans(count, n_init=restarts, random_state=0)``.
+
+    The algorithm is written out, draw for draw, so that nothing needs to be installed: greedy k-means++ from
+    NumPy's legacy generator, then Lloyd's iterations to scikit-learn's tolerance; of several restarts the one
+    of least inertia.
+
+    Source: SplatFields (Mihajlovic et al. 2024), program; scikit-learn 1.3 and later, ``KMeans``.
+    """
+
+    count: int
+    restarts: int
+
+    def select(self, positions: NDArray[np.float64]) -> tuple[int, ...]:
+        """Return one frame per centre, in increasing order."""
+        if self.count > len(positions):
+            return tuple(range(self.count))
+        middle = positions.mean(axis=0)
+        points = positions - middle
+        random = np.random.RandomState(0)
+        runs = [_lloyd(points, _greedy_plus_plus(points, self.count, random)) for _ in range(self.restarts)]
+        _, centres = min(runs, key=lambda run: run[0])
+        # In the world, as the program has it: of two cameras that share a centre, rounding decides.
+        distances = np.linalg.norm(positions[:, None] - (centres + middle), axis=-1)
+        return tuple(sorted(int(i) for i in distances.argmin(axis=0)))
+
+
+def _greedy_plus_plus(
+    points: NDArray[np.float64], count: int, random: np.random.RandomState
+) -> NDArray[np.float64]:
+    """Draw ``(count, 3)`` starting centres: each the best of some candidates by what is left of the
+    distances."""
+    chosen = [int(random.choice(len(points), p=np.full(len(points), 1 / len(points))))]
+    gap = _squared_distances(points, points[chosen])[:, 0]
+    while len(chosen) < count:
+        drawn = random.uniform(size=2 + int(np.log(count))) * gap.sum()
+        candidates = np.minimum(np.searchsorted(np.cumsum(gap), drawn), len(points) - 1)
+        left = np.minimum(gap, _squared_distances(points[candidates], points))
+        best = int(left.sum(axis=1).argmin())
+        gap = left[best]
+        chosen.append(int(candidates[best]))
+    return points[chosen]
+
+
+def _lloyd(points: NDArray[np.float64], centres: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+    """Return the inertia and the centres where the clusters, or nearly the centres, no longer change."""
+    tolerance = 1e-4 * float(points.var(axis=0).mean())
+    before = np.full(len(points), -1)
+    for _ in range(300):
+        nearest = _squared_distances(points, centres).argmin(axis=1)
+        members = [points[nearest == k] for k in range(len(centres))]
+        moved = np.stack([m.mean(axis=0) if len(m) else c for m, c in zip(members, centres, strict=True)])
+        shift, centres = float(((moved - centres) ** 2).sum()), moved
+        if np.array_equal(nearest, before) or shift <= tolerance:
+            break
+        before = nearest
+    return float(_squared_distances(points, centres).min(axis=1).sum()), centres
+
+
+Selection = Listed | Every | First | Seeded | Spread | KMeans | NearestToCentres
 
 
 def _squared_distances(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -191,11 +252,15 @@ PROTOCOLS: dict[str, Protocol] = {
 def get_protocol(name: str) -> Protocol:
     """Return the protocol of that name.
 
-    Besides :data:`PROTOCOLS`, ``views<N>`` stands for N training views by NumPy's seed-0 choice and
-    ``first<N>`` for the first N, both with size, background and test views of ``dietnerf8``; ``spread<N>``
-    for N evenly spread over the list and all test views, as stored (RegNeRF's 3, 6 and 9 views of LLFF
-    scenes). Any of them followed by ``-validation``, such as ``dietnerf8-validation``, trains on the same
-    views and scores training frames outside them: for choosing settings without a look at the test views.
+    Besides :data:`PROTOCOLS` there are counted forms. ``views<N>`` stands for N training views by NumPy's
+    seed-0 choice and ``first<N>`` for the first N, both with size, background and test views of
+    ``dietnerf8``; ``spread<N>`` for N evenly spread over the list and all test views, as stored (RegNeRF's 3,
+    6 and 9 views of LLFF scenes; few views of any scene of which every eighth is held out); ``human<N>`` for
+    N evenly spread views of a body, of which ``human8`` is one; ``splatfields<N>`` for the views of
+    SplatFields as scikit-learn finds them today (one start), and ``splatfields<N>-ninit10`` as it did by
+    default when that was published (ten starts), both on all test views as stored. Any of them followed by
+    ``-validation``, such as ``dietnerf8-validation``, trains on the same views and scores training frames
+    outside them: for choosing settings without a look at the test views.
 
     Raises:
         InputError: for an unknown name.
@@ -207,15 +272,22 @@ def get_protocol(name: str) -> Protocol:
         return PROTOCOLS[name]
     if name.endswith(_SUFFIX) and not name.removesuffix(_SUFFIX).endswith(_SUFFIX):
         return replace(get_protocol(name.removesuffix(_SUFFIX)), name=name, validates=True)
-    counted = re.fullmatch(r"(views|first|spread)([1-9]\d{0,5})", name)
-    if counted is None:
+    counted = re.fullmatch(r"(views|first|spread|human|splatfields)([1-9]\d{0,5})(-ninit10)?", name)
+    if counted is None or (counted[3] and counted[1] != "splatfields"):
         known = ", ".join(PROTOCOLS)
         raise ConfigError(
             ("protocol",),
-            f"found {name!r}, expected one of {known}, views<N>, first<N>, spread<N>, or one of these with -validation",
+            f"found {name!r}, expected one of {known}, views<N>, first<N>, spread<N>, human<N>, splatfields<N>, "
+            "splatfields<N>-ninit10, or one of these with -validation",
         )
     count = int(counted[2])
     if counted[1] == "spread":
         return Protocol(name, Spread(count), Every(1), None, "white", "RegNeRF, on LLFF scenes")
+    if counted[1] == "splatfields":
+        chosen = NearestToCentres(count, 10 if counted[3] else 1)
+        return Protocol(name, chosen, Every(1), None, "white", "SplatFields")
+    if counted[1] == "human":
+        views = Listed(tuple(48 * k // count for k in range(count)))
+        return Protocol(name, views, Every(1), None, "white", f"a study of human bodies with {count} views")
     train: Selection = Seeded(count) if counted[1] == "views" else First(count)
     return Protocol(name, train, Every(8), 800, "white", f"a study with {count} views")
