@@ -6,9 +6,11 @@ from dataclasses import MISSING, dataclass, fields, replace
 from typing import Any
 
 import pytest
+import torch
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
+from torch import nn
 
 import gridreg
 from gridreg.attach.sites import Selector, Site
@@ -264,6 +266,37 @@ def test_an_unknown_name_is_an_attribute_error() -> None:
 def test_the_fine_tuned_row_is_no_composition_of_its_own() -> None:
     with pytest.raises(gridreg.InputError, match=r"as published it is 'few_tensorf'.*preset of this name"):
         gridreg.composition("few_tensorf_finetuned")
+
+
+class Undecided(nn.Module):
+    """A field whose decoder has no encoding of positions."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.line = nn.Parameter(torch.ones(1, 6, 5, 1))
+
+    def sites(self) -> dict[str, gridreg.Site]:
+        return {"density": gridreg.Site(gridreg.parameters("line", dim=1))}
+
+
+def test_what_acts_on_a_missing_site_may_be_skipped() -> None:
+    field = Undecided()
+    with pytest.raises(gridreg.InputError, match="declares no site of this name"):
+        gridreg.apply(field, *gridreg.composition("few_tensorf"), total_steps=10)
+    handle = gridreg.apply(field, *gridreg.composition("few_tensorf", missing="skip"), total_steps=10)
+    kept = [(type(r).__name__, getattr(r, "site", None)) for r in handle.regularizers]
+    assert kept == [
+        ("FrequencyMask", "density"),
+        ("OcclusionLoss", None),
+        ("L1", "density"),
+        ("Orthogonality", "density"),
+    ]
+    (plain,) = gridreg.to_config([gridreg.FixedMask("density?")])
+    assert plain["site"] == "density?"
+    with pytest.raises(gridreg.InputError, match="Linear declares none of the sites density, appearance"):
+        gridreg.apply(nn.Linear(1, 1), *gridreg.composition("few_tensorf", missing="skip"), total_steps=10)
+    with pytest.raises(gridreg.InputError, match="missing='drop': expected 'refuse' or 'skip'"):
+        gridreg.composition("few_tensorf", missing="drop")  # type: ignore[arg-type]
 
 
 def test_rivals_are_there() -> None:

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 from torch import nn
 
 from gridreg.attach._binding import Attachment
+from gridreg.attach._resolve import sites_of
 from gridreg.attach.handle import Handle
 from gridreg.base import Clock, Regularizer
 from gridreg.errors import InputError
@@ -17,7 +21,8 @@ def apply(field: nn.Module, *regularizers: Regularizer, total_steps: int, seed: 
 
     Args:
         field: any module.
-        regularizers: in this order; two masks on one site multiply.
+        regularizers: in this order; two masks on one site multiply. One whose site is a name with a question mark
+            (``"encoding.position?"``) is left out where the field declares no such site.
         total_steps: length of the training run, iterations; fractions in schedules refer to it.
         seed: of the handle's own random numbers.
 
@@ -41,7 +46,25 @@ def apply(field: nn.Module, *regularizers: Regularizer, total_steps: int, seed: 
         raise InputError(
             f"total_steps={total_steps!r}: expected the number of training steps, an int above 0"
         )
-    return Handle(Attachment(field, regularizers, Clock(int(total_steps), seed)))
+    return Handle(Attachment(field, _without_missing(field, regularizers), Clock(int(total_steps), seed)))
+
+
+def _without_missing(field: nn.Module, regularizers: Sequence[Regularizer]) -> list[Regularizer]:
+    """The regularizers without those whose site may be missing and is."""
+    kept, missing, found = [], [], False
+    for regularizer in regularizers:
+        site = getattr(regularizer, "site", None)
+        if not isinstance(site, str) or not site.endswith("?"):
+            kept.append(regularizer)
+        elif site[:-1] in sites_of(field):
+            kept.append(replace(regularizer, site=site[:-1]))  # type: ignore[call-arg]
+            found = True
+        else:
+            missing.append(site[:-1])
+    if missing and not found:
+        names = ", ".join(dict.fromkeys(missing))
+        raise InputError(f"{type(field).__name__} declares none of the sites {names}; see gridreg.sites_of")
+    return kept
 
 
 def _check_regularizer(value: object) -> None:

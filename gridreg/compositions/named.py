@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Literal
 
 from gridreg.base import Regularizer
 from gridreg.errors import InputError, near_names
@@ -46,8 +47,13 @@ def composition_names() -> list[str]:
     return sorted(_COMPOSITIONS)
 
 
-def composition(name: str) -> list[Regularizer]:
+def composition(name: str, missing: Literal["refuse", "skip"] = "refuse") -> list[Regularizer]:
     """The regularizers of a named composition, in order.
+
+    Args:
+        name: one of `composition_names`.
+        missing: "skip": `gridreg.apply` leaves out what acts on a site that the field does not declare, such as the
+            mask of a position encoding; such sites are written with a question mark, ``"encoding.position?"``.
 
     Raises:
         InputError: there is none of this name; lists those there are.
@@ -60,7 +66,16 @@ def composition(name: str) -> list[Regularizer]:
     if name not in _COMPOSITIONS:
         hint = near_names(name, composition_names())
         raise InputError(f"composition={name!r}: expected one of {', '.join(composition_names())}{hint}")
-    return _COMPOSITIONS[name]()
+    if missing not in ("refuse", "skip"):
+        raise InputError(f"missing={missing!r}: expected 'refuse' or 'skip'")
+    found = _COMPOSITIONS[name]()
+    return found if missing == "refuse" else [_optional(regularizer) for regularizer in found]
+
+
+def _optional(regularizer: Regularizer) -> Regularizer:
+    """The regularizer, left out where the field does not declare its site."""
+    site = getattr(regularizer, "site", None)
+    return replace(regularizer, site=f"{site}?") if isinstance(site, str) else regularizer  # type: ignore[call-arg]
 
 
 def _none() -> list[Regularizer]:
