@@ -225,6 +225,19 @@ def test_bad_input_ends_with_one_line_and_status_2(tmp_path):
     ]
 
 
+def test_studies_that_come_along_are_found_by_name(tmp_path, capsys):
+    assert run(AblationOptions(example="smoke", out=tmp_path / "out", dry_run=True)) == 0
+    assert "waiting" in capsys.readouterr().out
+    assert not (tmp_path / "out").exists()
+    with pytest.raises(
+        InputError, match=r"--example: found 'smok', expected one of .*did you mean 'smoke'\?"
+    ):
+        run(AblationOptions(example="smok"))
+    for wrong in (AblationOptions(), AblationOptions(Path("study.yaml"), example="smoke")):
+        with pytest.raises(InputError, match="expected a YAML file, or --example NAME"):
+            run(wrong)
+
+
 def titled(language, title):
     return [
         text for lang, name, text in TITLED.findall(PAGE.read_text()) if (lang, name) == (language, title)

@@ -16,7 +16,7 @@ from gridreg.ablation.runners import InProcess, Runner
 from gridreg.ablation.store import Store
 from gridreg.ablation.study import load_study
 from gridreg.cores import usable_cores
-from gridreg.errors import InputError
+from gridreg.errors import InputError, near_names
 
 __all__ = ["AblationOptions", "make_runner", "run"]
 
@@ -25,8 +25,10 @@ __all__ = ["AblationOptions", "make_runner", "run"]
 class AblationOptions:
     """Do the runs of a study that are missing in its store, and write tables and a report."""
 
-    study: tyro.conf.Positional[Path]
+    study: tyro.conf.Positional[Path | None] = None
     """YAML file of the study."""
+    example: str | None = None
+    """Name of a study that comes with gridreg, instead of a file, such as smoke."""
     out: Path | None = None
     """Folder of the store; default: outputs/NAME. What is finished there is not done again."""
     runner: Literal["local", "processes", "ray"] = "local"
@@ -60,7 +62,7 @@ def run(options: AblationOptions) -> int:
     Raises:
         InputError: for a study, store or runner that cannot be used; what is finished stays.
     """
-    study = load_study(options.study)
+    study = load_study(_study_file(options))
     out = options.out or Path("outputs") / study.name
     if options.dry_run:
         _print_runs(study, out, options)
@@ -81,6 +83,22 @@ def run(options: AblationOptions) -> int:
         interrupted = True
         print("stopped; the same command goes on from here", file=sys.stderr)
     return _conclude(store, study, options, interrupted)
+
+
+def _study_file(options: AblationOptions) -> Path:
+    """The file of the study; an example is installed beside this file, or in ``examples/studies`` of a checkout."""
+    if (options.study is None) == (options.example is None):
+        found = "nothing" if options.study is None else "both"
+        raise InputError(f"study: found {found}, expected a YAML file, or --example NAME")
+    if options.study is not None:
+        return options.study
+    folder = Path(__file__).parent / "studies"
+    folder = folder if folder.is_dir() else Path(__file__).parents[2] / "examples" / "studies"
+    names = sorted(path.stem for path in folder.glob("*.yaml"))
+    if options.example not in names:
+        near = near_names(options.example, names)
+        raise InputError(f"--example: found {options.example!r}, expected one of {', '.join(names)}{near}")
+    return folder / f"{options.example}.yaml"
 
 
 def make_runner(options: AblationOptions) -> Runner:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -139,6 +140,7 @@ class RunResult:
         folder: holds ``test/*.png``, ``history.jsonl``, ``config.yaml``, ``checkpoint/``, ``result.json``.
         seconds: the run took, interruptions left out; 0 before it is finished.
         machine: that finished it.
+        images: of test views by name, and of their targets by ``target:NAME``, where they are not in the folder.
     """
 
     spec: RunSpec
@@ -148,6 +150,7 @@ class RunResult:
     folder: Path
     seconds: float
     machine: str
+    images: Mapping[str, Path] = field(default_factory=dict)
 
     def history(self) -> list[dict[str, Any]]:
         """Rows of the run's curves, ``{"step": n, name: value, ...}``, masks under ``masks``; empty if there are none.

@@ -14,11 +14,12 @@ from gridreg.ablation.differences import forest_plot, heat_map
 from gridreg.ablation.mask_images import colour_scale, mask_schedules
 from gridreg.ablation.records import RunResult, Study
 from gridreg.ablation.tables import (
-    COLUMNS,
     LEGEND,
     SIGNS,
+    columns_of,
     difference_text,
     duration,
+    further_metrics,
     latex,
     markdown,
     mean_text,
@@ -36,7 +37,7 @@ __all__ = ["IMAGE_BYTES", "HasResults", "findings", "provenance", "write_report"
 IMAGE_BYTES = 6_000_000
 """Default bound on what images add to the page."""
 
-_FIGURES = (signed, mean_text, difference_text, duration, notes_of)
+_FIGURES = (columns_of, further_metrics, signed, mean_text, difference_text, duration, notes_of)
 _VERSIONS = ("gridreg", "torch", "numpy", "numba", "python")
 _MACHINE = ("cpu", "instructions", "cores", "threads")
 
@@ -107,6 +108,7 @@ def _page(study: Study, results: Sequence[RunResult], sections: Sequence[Section
     return render(
         "report.html",
         study=study,
+        source_name=study.name if study.name.endswith(".csv") else f"{study.name}.yaml",
         done=sum(result.status == "done" for result in results),
         views=over_views(sections),
         sections=[
@@ -128,7 +130,6 @@ def _page(study: Study, results: Sequence[RunResult], sections: Sequence[Section
         provenance=provenance(study, results),
         download="data:text/yaml;base64," + base64.b64encode(source).decode(),
         images=images,
-        columns=COLUMNS,
         legend=LEGEND,
         signs=SIGNS,
         tone=lambda outcome: {"higher": "up", "lower": "down"}.get(outcome, "noise"),

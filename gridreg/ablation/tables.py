@@ -13,12 +13,13 @@ from gridreg.ablation.statistics import Estimate
 from gridreg.ablation.templates import render
 
 __all__ = [
-    "COLUMNS",
     "LEGEND",
     "MINUS",
     "SIGNS",
+    "columns_of",
     "difference_text",
     "duration",
+    "further_metrics",
     "latex",
     "markdown",
     "mean_text",
@@ -45,15 +46,8 @@ LEGEND = (
     "training views."
 )
 
-COLUMNS: tuple[str, ...] = (
-    "composition",
-    "PSNR (dB)",
-    "Δ PSNR (dB)",
-    "SSIM (Gaussian)",
-    "training",
-    "runs",
-    "notes",
-)
+_COLUMNS = ("composition", "PSNR (dB)", "Δ PSNR (dB)", "SSIM (Gaussian)", "training", "runs", "notes")
+_SHOWN = ("psnr", "ssim_gaussian", "ssim_uniform")
 
 
 def signed(value: float, digits: int = 2) -> str:
@@ -108,6 +102,16 @@ def notes_of(row: Row) -> list[str]:
     return notes
 
 
+def further_metrics(section: Section) -> list[str]:
+    """Names of metrics that have no column of their own, in a table that somebody else has made."""
+    return list(dict.fromkeys(m for row in section.rows for m in row.metrics if m not in _SHOWN))
+
+
+def columns_of(section: Section) -> tuple[str, ...]:
+    """Heads of the columns of a section's table."""
+    return (*_COLUMNS[:4], *further_metrics(section), *_COLUMNS[4:])
+
+
 def markdown(title: str, sections: Sequence[Section]) -> str:
     """All tables of a study in Markdown (GitHub's tables), with a legend.
 
@@ -125,19 +129,20 @@ def latex(title: str, sections: Sequence[Section]) -> str:
 
 def _tables(section: Section) -> list[tuple[tuple[str, ...], list[tuple[str, ...]]]]:
     """Head and body of the table of a section, and of the one by scene where there are several scenes."""
-    found = [(COLUMNS, [_cells(row) for row in section.rows])]
+    found = [(columns_of(section), [_cells(row, further_metrics(section)) for row in section.rows])]
     if len(section.scenes) > 1:
         body = [(row.name, *(mean_text(row.scenes.get(s)) for s in section.scenes)) for row in section.rows]
         found.append((("PSNR (dB)", *section.scenes), body))
     return found
 
 
-def _cells(row: Row) -> tuple[str, ...]:
+def _cells(row: Row, further: Sequence[str]) -> tuple[str, ...]:
     return (
         row.name,
         mean_text(row.metrics.get("psnr")),
         difference_text(row),
         mean_text(row.metrics.get("ssim_gaussian"), 3),
+        *(mean_text(row.metrics.get(metric), 3) for metric in further),
         duration(row.seconds.mean) if row.seconds else "–",
         f"{row.done}" if row.done == row.expected else f"{row.done} of {row.expected}",
         ", ".join(notes_of(row)),

@@ -109,11 +109,11 @@ def _views_of(runs: Iterable[RunResult]) -> list[str]:
 def _images(runs: Mapping[str, RunResult], view: str) -> list[dict[str, Any]]:
     images: list[dict[str, Any]] = []
     for name, run in runs.items():
-        render = _opened(run.folder / "test" / f"{view}.png")
+        render = _opened(run.images.get(view, run.folder / "test" / f"{view}.png"))
         if render is None:
             continue
         if not images:
-            target = _target(run.folder / "test" / f"{view}_compare.png", render)
+            target = _target(run, view, render)
             if target is not None:
                 images.append({"name": "target", "psnr": None, "src": encode(target)})
         psnr = float((run.metrics or {})["images"][view].get("psnr", "nan"))
@@ -121,9 +121,11 @@ def _images(runs: Mapping[str, RunResult], view: str) -> list[dict[str, Any]]:
     return images
 
 
-def _target(path: Path, render: Image.Image) -> Image.Image | None:
-    """The target, which stands at the left of the comparison, enlarged by whole pixels."""
-    comparison = _opened(path)
+def _target(run: RunResult, view: str, render: Image.Image) -> Image.Image | None:
+    """The target, which stands at the left of the comparison, enlarged by whole pixels, where it has no file."""
+    if f"target:{view}" in run.images:
+        return _opened(run.images[f"target:{view}"])
+    comparison = _opened(run.folder / "test" / f"{view}_compare.png")
     if comparison is None:
         return None
     zoom = (comparison.height - _STRIP) // render.height
@@ -135,7 +137,7 @@ def _target(path: Path, render: Image.Image) -> Image.Image | None:
 
 def _opened(path: Path) -> Image.Image | None:
     try:
-        with Image.open(path, formats=["PNG"]) as image:
+        with Image.open(path, formats=["PNG", "JPEG"]) as image:
             converted: Image.Image = image.convert("RGB")
             return converted
     except (OSError, UnidentifiedImageError, Image.DecompressionBombError):

@@ -55,6 +55,11 @@ COMMANDS: dict[str, Command] = {
         "gridreg.ablation.command:AblationOptions",
         "gridreg.ablation.command:run",
     ),
+    "report": Command(
+        "make the report of a table of anybody's results",
+        "gridreg.ablation.table_report:ReportOptions",
+        "gridreg.ablation.table_report:run",
+    ),
     "bench": _own("run a benchmark of a checkout", "bench", "BenchOptions"),
 }
 """The commands by name, in the order of the overview."""
