@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,7 +18,7 @@ import stored
 from timing import main
 from timing.work import Counts
 
-__all__ = ["COUNTS", "SMALL", "TINY", "one_thread", "run"]
+__all__ = ["COUNTS", "SMALL", "TINY", "die", "one_thread", "run"]
 
 TINY = ["--set", "train.rays=48", "field.density_components=4", "field.appearance_components=6"]
 SMALL = ["train.voxels_start=512", "train.voxels_end=1728", "train.occupancy_resolution=12"]
@@ -62,3 +63,8 @@ def run(words: list[str], results: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert record["name"].startswith(words[0])
     assert str(results) not in json.dumps(record)
     return record, capsys.readouterr().out
+
+
+def die(_: object) -> None:
+    """End a process as the system does when memory is short."""
+    os._exit(9)

@@ -18,7 +18,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 from timing import common, main, masks, whole_run
 from timing.ball import ball_step
 
-from tests.speed_runs import SMALL, TINY, one_thread, run
+from tests.speed_runs import SMALL, TINY, die, one_thread, run
 
 
 @pytest.fixture(scope="module")
@@ -165,17 +165,18 @@ def test_compiling_is_counted(
     assert "| later | 0 | 0.0 |" in printed
 
 
-def test_a_run_that_fails_says_why(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_that_fails_says_why(scene: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no_such_preset"):
         main.main(["schedule", "--scene", str(scene), "--preset", "no_such_preset"])
-    program = tmp_path / "program.py"
-    program.write_text("import sys\nsys.exit('a warning\\nerror: the disk is full')")
-    monkeypatch.setattr(whole_run, "PROGRAM", program)
-    with pytest.raises(InputError, match=r"failed: the disk is full$"):
+    # What the process of its own finds arrives as it is.
+    with pytest.raises(InputError, match="expected"):
+        main.main(["schedule", "--scene", str(tmp_path), "--protocol", "builtin8", "--steps", "3"])
+
+
+def test_a_run_that_is_killed_says_so(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(whole_run, "run_here", die)
+    with pytest.raises(InputError, match="the run in a process of its own was killed"):
         main.main(["schedule", "--scene", str(scene)])
-    program.write_text("raise SystemExit(130)")
-    with pytest.raises(KeyboardInterrupt):
-        main.main(["memory", "--scene", str(scene)])
 
 
 def test_names_of_files_stay_short() -> None:

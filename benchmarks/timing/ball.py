@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -143,8 +143,3 @@ def ball_step(
 ) -> BallStep:
     """A `BallStep` from plain numbers."""
     return BallStep(ball_field(backbone, edge, components), ball_rays(rays), **options)
-
-
-def as_contestants(steps: dict[str, BallStep]) -> dict[str, Callable[[int], object]]:
-    """For `speed.common.in_turns`."""
-    return dict(steps)

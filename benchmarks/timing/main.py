@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 import stored
 import torch
 
-from . import common, compiling, frame, masks, memory, roofline, scaling, schedule, step, whole_run
+from . import common, compiling, frame, masks, memory, roofline, scaling, schedule, step
 from .common import existing_folder
 
 COMMANDS = {
@@ -63,11 +62,7 @@ def main(words: Sequence[str] | None = None) -> int:
     Raises:
         InputError: for bad input.
     """
-    given = list(sys.argv[1:] if words is None else words)
-    if given[:1] == ["run"]:
-        # Not for people: a run in a process of its own.
-        return whole_run.main(given[1:])
-    arguments = parser().parse_args(given)
+    arguments = parser().parse_args(words)
     if arguments.command == "table":
         print(table(arguments.results))
         return 0

@@ -13,7 +13,7 @@ import gridreg
 from gridreg.errors import InputError
 
 from . import common
-from .ball import BallStep, as_contestants, ball_field, ball_rays
+from .ball import BallStep, ball_field, ball_rays
 from .common import Record
 
 HELP = "masked against unmasked steps: masks that have opened, and several fractions of open channels"
@@ -65,7 +65,7 @@ def measure(arguments: argparse.Namespace) -> tuple[Record, str]:
         field = ball_field(arguments.backbone, arguments.edge)
         composition = [gridreg.FixedMask(site, visible_ratio=value) for site in sites]
         steps[f"{value:g}"] = BallStep(field, rays, composition)
-    times = common.in_turns(as_contestants(steps), arguments.repeats)
+    times = common.in_turns(dict(steps), arguments.repeats)
     found = common.ratios(times, "no masks")
     rows = {
         name: {

@@ -7,7 +7,7 @@ import argparse
 import torch
 
 from . import common
-from .ball import BallStep, as_contestants, ball_field, ball_rays, ball_step
+from .ball import BallStep, ball_field, ball_rays, ball_step
 from .common import Record
 from .situations import threads
 
@@ -50,7 +50,7 @@ def _row(step: BallStep, seconds: list[float]) -> Record:
 
 def sweep(steps: dict[str, BallStep], repeats: int) -> dict[str, Record]:
     """Each step in turns with the others."""
-    times = common.in_turns(as_contestants(steps), repeats)
+    times = common.in_turns(dict(steps), repeats)
     return {name: _row(steps[name], values) for name, values in times.items()}
 
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import json
+import multiprocessing
 import resource
-import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +20,10 @@ from gridreg.errors import InputError
 from gridreg.ops import use_backend
 from gridreg.ops.cpu.jit.compiler import Kernel
 from gridreg.training import Execution, StepReport, TrainSettings, execute
-from gridreg.training.files import write_json
 
 from . import common
 from .common import Record
 from .stopwatch import replaced
-
-PROGRAM = Path(__file__).parents[1] / "speed.py"
 
 
 def peak_bytes(status: Path = Path("/proc/self/status")) -> int:
@@ -176,43 +174,18 @@ def _counted(function: Callable[[Kernel], Any], kernels: dict[str, Any]) -> Call
 
 
 def run_apart(arguments: argparse.Namespace) -> Record:
-    """`run_here` in a fresh process.
+    """Return the figures of `run_here` in a fresh process.
 
     Raises:
-        InputError: what the process says when it ends badly.
+        InputError: of the run; or if its process was killed.
     """
     # What is wrong with the command line shows here, at once.
     common.configuration(arguments, arguments.steps)
-    with tempfile.TemporaryDirectory() as folder:
-        target = Path(folder) / "figures.json"
-        given = {k: v for k, v in vars(arguments).items() if k not in ("measure", "show", "results")}
-        plain: dict[str, Any] = {k: str(v) if isinstance(v, Path) else v for k, v in given.items()}
-        plain["threads"] = torch.get_num_threads()
-        ended = subprocess.run(
-            [sys.executable, str(PROGRAM), "run", "--given", json.dumps(plain), "--into", str(target)],
-            stderr=subprocess.PIPE if not sys.stderr.isatty() else None,
-            text=True,
-            check=False,
-        )
-        if ended.returncode == 130:
-            raise KeyboardInterrupt
-        if ended.returncode or not target.is_file():
-            lines = (ended.stderr or "").strip().splitlines()
-            said = lines[-1].removeprefix("error: ") if lines else f"status {ended.returncode}"
-            raise InputError(f"the run in a process of its own failed: {said}")
-        found: Record = json.loads(target.read_text())
-        return found
-
-
-def main(words: list[str]) -> int:
-    """The other side of `run_apart`."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--given", type=json.loads, required=True)
-    parser.add_argument("--into", type=Path, required=True)
-    options = parser.parse_args(words)
-    arguments = argparse.Namespace(**options.given)
-    if arguments.scene is not None:
-        arguments.scene = Path(arguments.scene)
-    torch.set_num_threads(arguments.threads)
-    write_json(options.into, run_here(arguments), sort_keys=False)
-    return 0
+    threads = torch.get_num_threads()
+    with ProcessPoolExecutor(
+        1, multiprocessing.get_context("spawn"), torch.set_num_threads, (threads,)
+    ) as pool:
+        try:
+            return pool.submit(run_here, arguments).result()
+        except BrokenProcessPool:
+            raise InputError("the run in a process of its own was killed; was the memory enough?") from None
