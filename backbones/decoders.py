@@ -34,7 +34,7 @@ class Basis(nn.Linear):
 
     @property
     def input_dtype(self) -> torch.dtype:
-        """What it rounds its input to."""
+        """The dtype to which the input is rounded."""
         return ops.product_dtype(self.precision)
 
     def forward(self, components: Tensor) -> Tensor:

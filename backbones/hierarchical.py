@@ -24,8 +24,8 @@ def stratified(t_min: Tensor, t_max: Tensor, count: int, jitter: Tensor) -> tupl
         >>> t.tolist(), edges.tolist()
         ([[2.5, 3.5]], [[2.0, 3.0, 4.0]])
     """
-    share = torch.arange(count + 1, dtype=t_min.dtype, device=t_min.device) / count
-    edges = torch.lerp(t_min[:, None], t_max[:, None], share)
+    fractions = torch.arange(count + 1, dtype=t_min.dtype, device=t_min.device) / count
+    edges = torch.lerp(t_min[:, None], t_max[:, None], fractions)
     return torch.lerp(edges[:, :-1], edges[:, 1:], jitter[:, None]), edges
 
 
@@ -55,8 +55,8 @@ def inverse_transform(
     wanted = ((steps + jitter[:, None]) / count).contiguous()
     part = (torch.searchsorted(cumulative, wanted, right=True) - 1).clamp(0, weights.shape[1] - 1)
     low, high = cumulative.gather(1, part), cumulative.gather(1, part + 1)
-    share = ((wanted - low) / (high - low).clamp(min=torch.finfo(edges.dtype).tiny)).clamp(0, 1)
-    return torch.lerp(edges.gather(1, part), edges.gather(1, part + 1), share)
+    fraction = ((wanted - low) / (high - low).clamp(min=torch.finfo(edges.dtype).tiny)).clamp(0, 1)
+    return torch.lerp(edges.gather(1, part), edges.gather(1, part + 1), fraction)
 
 
 def intervals(t: Tensor, t_min: Tensor, t_max: Tensor) -> Tensor:

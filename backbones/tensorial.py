@@ -1,4 +1,4 @@
-"""What VM- and CP-TensoRF share: a box, a density activation, a basis and a decoder."""
+"""Base of VM- and CP-TensoRF: a box, a density activation, a basis and a decoder."""
 
 from __future__ import annotations
 
@@ -231,7 +231,7 @@ class TensorialField(nn.Module):
     def make_optimizer(
         self, groups: list[dict[str, Any]], betas: tuple[float, float]
     ) -> torch.optim.Optimizer:
-        """Adam that folds grid penalties into its one pass over memory.
+        """Adam that adds the gradients of grid penalties in its one pass over memory.
 
         Args:
             groups: as of `parameter_groups`, with learning rates.

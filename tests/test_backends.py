@@ -301,3 +301,29 @@ class TestChoice:
         """
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
         assert done.stdout.strip() == "0.5", done.stderr
+
+    def test_without_numba_all_is_plain(self):
+        code = """if True:
+            import sys
+            class Missing:
+                def find_spec(self, name, path=None, target=None):
+                    if name.split(".")[0] in ("numba", "llvmlite"):
+                        raise ModuleNotFoundError(name)
+            sys.meta_path.insert(0, Missing())
+            import torch
+            from backbones.vm import VMField
+            from gridreg import ops
+            field = VMField(torch.tensor([[-1.0] * 3, [1.0] * 3]), (5, 5, 5))
+            x = torch.rand(4, 3)
+            optimizer = field.make_optimizer(field.parameter_groups(), (0.9, 0.99))
+            with field.gradient_context():
+                (field.density(x).sum() + field.colour(x, x).sum()).backward()
+            optimizer.step()
+            assert not any(isinstance(one, ops.dispatch.Operation) and one.compiled for one in vars(ops).values())
+            try:
+                ops.use_backend("compiled")
+            except ValueError as error:
+                print(error)
+        """
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+        assert done.stdout.startswith("backend 'compiled': numba is not installed"), done.stderr

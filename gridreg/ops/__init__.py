@@ -6,7 +6,6 @@ Importing this package registers the compiled versions, if numba is there; see `
 from __future__ import annotations
 
 import importlib
-import importlib.util
 
 from gridreg.ops.composite import accumulate, composite_weights, pixels, terminate
 from gridreg.ops.cp import cp_density, cp_features, cp_march_density
@@ -47,5 +46,13 @@ __all__ = [
     "vm_march_density",
 ]
 
-if importlib.util.find_spec("numba") is not None:
+
+def _register_compiled() -> None:
+    try:
+        importlib.import_module("numba")
+    except ImportError:
+        return
     importlib.import_module("gridreg.ops.cpu.registered")
+
+
+_register_compiled()

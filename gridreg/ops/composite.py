@@ -59,10 +59,10 @@ def _depth_before(optical_depth: Tensor, offsets: Tensor) -> Tensor:
     for samples, part in _blocks(offsets):
         tau = finite[samples]
         ray = ray_of_sample(part, tau.numel())
-        place = torch.arange(tau.numel(), device=tau.device) - part[ray]
+        index = torch.arange(tau.numel(), device=tau.device) - part[ray]
         longest = int(part.diff().max())
-        padded = tau.new_zeros(part.numel() - 1, longest + 1).index_put((ray, place + 1), tau)
-        parts.append(padded.cumsum(1)[ray, place])
+        padded = tau.new_zeros(part.numel() - 1, longest + 1).index_put((ray, index + 1), tau)
+        parts.append(padded.cumsum(1)[ray, index])
     return torch.cat(parts)
 
 

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from gridreg.errors import InputError
 
-__all__ = ["Operation", "chosen_backend", "is_cpu_float32", "operation", "takes_compiled", "use_backend"]
+__all__ = ["Operation", "chosen_backend", "is_cpu_float32", "operation", "use_backend"]
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
@@ -149,8 +149,3 @@ def operation(
         return Operation(reference, check)
 
     return wrap
-
-
-def takes_compiled(*tensors: Tensor) -> bool:
-    """Whether the choice allows compiled code for these tensors: all on the CPU, all float32."""
-    return _choice != "torch" and all(x.is_cpu and x.dtype == torch.float32 for x in tensors)

@@ -15,7 +15,7 @@ __all__ = ["Ensemble"]
 
 
 class Ensemble(nn.Module):
-    """Several fields as one, to be rendered, filmed and meshed like any other `Field`.
+    """Several fields as one, to be rendered to images, videos and meshes like any other `Field`.
 
     Density is the mean of the members', colour their mean weighted by density, which is what a mixture of their matter
     emits. A member has nothing outside its occupied cells.
@@ -29,7 +29,7 @@ class Ensemble(nn.Module):
 
     References:
         Lakshminarayanan et al., "Simple and scalable predictive uncertainty estimation using deep ensembles" (2017);
-        Suenderhauf et al., "Density-aware NeRF ensembles" (2023), who take the mean of pictures instead.
+        Suenderhauf et al., "Density-aware NeRF ensembles" (2023), who take the mean of images instead.
     """
 
     bounds: Tensor
@@ -60,10 +60,10 @@ class Ensemble(nn.Module):
         """Positions and directions ``(N, 3)`` to colours ``(N, 3)`` in [0, 1]; the plain mean where nothing is."""
         densities = self._densities(x)
         total = densities.sum(0)
-        shares = torch.where(total > 0, densities / total.clamp(min=1e-12), 1 / len(densities))
+        fractions = torch.where(total > 0, densities / total.clamp(min=1e-12), 1 / len(densities))
         fields: list[Any] = list(self.members)
         return torch.stack(
-            [s[:, None] * field.colour(x, d) for s, field in zip(shares, fields, strict=True)]
+            [s[:, None] * field.colour(x, d) for s, field in zip(fractions, fields, strict=True)]
         ).sum(0)
 
     def _densities(self, x: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Which cells of the box may hold something: the march skips all others."""
+"""Occupancy of the cells of a box: the march skips those that hold nothing."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class OccupancyGrid:
 
     @property
     def fraction(self) -> float:
-        """Occupied share of the cells, in [0, 1]."""
+        """Occupied fraction of the cells, in [0, 1]."""
         return float(self.cells.float().mean())
 
     def centres(self, index: Tensor) -> Tensor:
@@ -157,7 +157,7 @@ def _footprint(total: Tensor, row: Tensor, column: Tensor, radius: Tensor) -> Te
 def _alpha_views(
     alpha: Tensor, poses: Tensor, intrinsics: Tensor
 ) -> Iterator[tuple[Tensor, bool, Tensor, Tensor]]:
-    """Of each view: summed-area table of its silhouette, whether that is whole, world-to-camera, intrinsics."""
+    """For each view: summed-area table of its silhouette, whether that is whole, world-to-camera, intrinsics."""
     for mask, pose, camera in zip(alpha > 0, poses, intrinsics, strict=True):
         total = F.pad(mask.long().cumsum(0).cumsum(1), (1, 0, 1, 0))
         cut = mask[0].any() | mask[-1].any() | mask[:, 0].any() | mask[:, -1].any()
@@ -177,7 +177,7 @@ def visual_hull(
     """Cells that no view proves empty: space carving from silhouettes (Laurentini 1994).
 
     A cell is carved when its whole projection, plus a margin, falls on pixels with alpha 0 in some view. A silhouette
-    that does not touch the edge of its picture is taken for the whole object, so that what lies beyond the edge is
+    that does not touch the edge of its image is taken for the whole object, so that what lies beyond the edge is
     empty, too; if it does touch the edge, the view carves only what it sees. What is behind a camera it never carves.
 
     Args:

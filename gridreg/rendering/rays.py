@@ -77,7 +77,7 @@ def camera_rays(pose: Tensor, intrinsics: Tensor, height: int, width: int) -> Ra
 def box_intersection(
     rays: Rays, bounds: Tensor, near: float | Tensor = 0.0, far: float | Tensor = 1e10
 ) -> tuple[Tensor, Tensor]:
-    """Where rays enter and leave an axis-aligned box (slab method, Kay and Kajiya 1986).
+    """Distances at which rays enter and leave an axis-aligned box (slab method, Kay and Kajiya 1986).
 
     Args:
         rays: ``R`` rays.

@@ -26,7 +26,7 @@ _BLOCK = 1 << 16
 
 
 class Field(Protocol):
-    """What the renderer asks of a field.
+    """The methods that the renderer asks of a field.
 
     It may also offer ``march_density(rays, t_min, t_max, step, occupancy, jitter, transmittance_bound)``, which returns
     a `gridreg.ops.RayMarchResult` (or a plain tuple of its first five or more); ``colour_of_rays(x, directions,
@@ -46,7 +46,7 @@ class Field(Protocol):
 
 
 class SampleHook(Protocol):
-    """What may change samples between the field and the compositing: a `gridreg.Handle`."""
+    """An object that may change samples between the field and the compositing: a `gridreg.Handle`."""
 
     def on_samples(self, samples: RaySamples, /) -> RaySamples:
         """The samples, perhaps with scaled gradients."""
@@ -55,7 +55,7 @@ class SampleHook(Protocol):
 
 @dataclass(frozen=True)
 class MarchSettings:
-    """How rays are sampled (ray marching).
+    """Settings of ray marching.
 
     Args:
         step: distance between samples, world units.
@@ -156,7 +156,7 @@ def render_rays(
         occupancy: cells that may hold something; samples elsewhere are skipped.
         march: step and bounds.
         background: colour behind the field, ``(3,)`` or ``(R, 3)``.
-        jitter: ``(R,)`` in [0, 1), the share of a step by which each ray's samples are shifted; None: 0.5.
+        jitter: ``(R,)`` in [0, 1), the fraction of a step by which each ray's samples are shifted; None: 0.5.
         near_far: ``(R,)`` each, instead of the march's near and far.
         hook: gets the samples before they are composited.
         generator: for training: draws the representatives of merged samples (the march's ``merge_weight``); None: the

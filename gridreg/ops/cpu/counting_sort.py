@@ -49,7 +49,7 @@ class Listing(NamedTuple):
 
 @inline
 def _count(rows: Any, base: int, samples: int, starts: Any, begin: int, edge: int) -> None:
-    """Make entry r + 1 the place where row r begins."""
+    """Set entry r + 1 to where row r begins."""
     for row in range(begin, begin + edge + 1):
         starts[row] = 0
     for n in range(base, base + samples):

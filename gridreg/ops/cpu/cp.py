@@ -101,7 +101,7 @@ def _features(
 
 
 class _Target(NamedTuple):
-    """Where a gradient is added for the node below a sample and the node above: arrays, and first elements."""
+    """Arrays that the gradients of the nodes below and above a sample are added to, and where channels begin."""
 
     lower: Any
     lower_first: Any

@@ -61,7 +61,7 @@ class Segment(NamedTuple):
 
 @inline
 def lookahead(read: int) -> int:
-    """How many samples ahead to ask for nodes of ``read`` channels."""
+    """Number of samples ahead to ask for nodes of ``read`` channels."""
     return max(_AHEAD // max(read, 1), 1)
 
 

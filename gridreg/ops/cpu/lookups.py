@@ -47,7 +47,7 @@ class _Lookup(torch.autograd.Function):
 
 
 def _gradients(ctx: Any, u: Tensor, grids: Sequence[Tensor], upstream: Tensor) -> list[Tensor | None]:
-    """What a backward pass returns for the grids."""
+    """Gradients of the grids, as a backward pass returns them."""
     buffers, returned = gradient_buffers(grids[:-3])
     given = [buffers] if buffers else []
     lines = ctx.backward_pass(

@@ -21,7 +21,7 @@ _REST = np.int64(2**63 - 1)
 # Edge, in cells, of the blocks that are skipped whole when nothing in them is occupied.
 _COARSE = np.uint32(4)
 _TOLERANCE = np.float32(ops.CELL_TOLERANCE)
-# Relative rounding of a position computed in float32 by a handful of operations, with room to spare.
+# Relative rounding of a position computed in float32 by a handful of operations, with a margin.
 _ROUNDING = np.float32(2e-6)
 _ONE = np.int64(1)
 _ZERO_F, _ONE_F = np.float32(0), np.float32(1)
@@ -105,7 +105,7 @@ def _coarsen(a: int, cells: Cube[uint8], coarse: Cube[uint8], columns: Matrix[ui
 
 @exact
 def _slab(origin: Any, direction: Any, far: Any, lower: Any, scale: Any, edge: Any) -> tuple[Any, Any, Any]:
-    """Of one axis: which face of a cell the ray leaves by, and a distance before it as ``(i - at) * rate``.
+    """For one axis: the face of a cell that the ray leaves by, and a distance before it as ``(i - at) * rate``.
 
     Along the ray the cell coordinate is ``start + t * speed`` up to ``slack`` cells of rounding.
     """
@@ -209,7 +209,7 @@ class _Blocks(NamedTuple):
 
 
 def _coarse(cells: Tensor, grid: Tensor) -> Tensor:
-    """Which blocks of cells hold an occupied one; kept for the thread's next march through the same cells."""
+    """Blocks of cells that hold an occupied one; kept for the thread's next march through the same cells."""
     version = None if cells.is_inference() else cells._version
     kept: _Blocks | None = getattr(_kept, "blocks", None)
     if kept is not None and version is not None and kept.of() is cells and kept.version == version:

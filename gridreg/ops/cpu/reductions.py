@@ -67,10 +67,10 @@ def _measure(task: int, x: Vector[float32], sums: Matrix[float64]) -> None:
 
 
 @inline
-def _mixed(bits: Any, place: Any) -> Any:
+def _mixed(bits: Any, index: Any) -> Any:
     """Thirty-two bits that look random: the finalizer of MurmurHash3 (Appleby 2011)."""
     low = int64(0xFFFFFFFF)
-    h = (bits ^ (place * int64(0x9E3779B1))) & low
+    h = (bits ^ (index * int64(0x9E3779B1))) & low
     h = ((h ^ (h >> 16)) * int64(0x85EBCA6B)) & low
     h = ((h ^ (h >> 13)) * int64(0xC2B2AE35)) & low
     return h ^ (h >> 16)
@@ -91,7 +91,7 @@ def round_stochastically(values: Tensor, fraction: float) -> Tensor:
     """Stochastic rounding of small values, so that most are 0 and their expectation stays.
 
     A value smaller than the floor, ``fraction`` of the mean size, becomes the floor with its sign with probability
-    ``size / floor``, and 0 otherwise. The draw comes from the value's own bits and its place: the same values are
+    ``size / floor``, and 0 otherwise. The draw comes from the value's own bits and its index: the same values are
     rounded in the same way.
 
     Args:

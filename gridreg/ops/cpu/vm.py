@@ -88,7 +88,7 @@ def look_up(
 ) -> None:  # fmt: skip
     """Product of plane and line ``k`` at a part (start, stop, count) of a batch whose first sample is ``n``.
 
-    If ``summed``, its sum over channels is added to ``out``, else its channels are written to their place.
+    If ``summed``, its sum over channels is added to ``out``, else its channels are written one after another.
     """
     start, stop, count = part
     plane, line = planes[k], lines[k]

@@ -34,7 +34,7 @@ __all__ = ["density_backward", "features_backward"]
 
 
 class _Target(NamedTuple):
-    """Where the gradient of a sample is added: arrays, and the element of each at which its channels begin.
+    """The elements to which the gradient of a sample is added: arrays, and the one of each at which its channels begin.
 
     ``lower`` and ``upper`` are for the two rows of the plane that the sample lies between. What falls on a row of
     another task, which sees the sample too, goes to an array that nobody reads.
@@ -49,7 +49,7 @@ class _Target(NamedTuple):
 
 
 class _Owned(NamedTuple):
-    """What a task may add to.
+    """Gradients that a task may add to.
 
     Args:
         plane: gradient of the plane.

@@ -162,10 +162,10 @@ def _constants(x: Any) -> tuple[Any, Any]:
 
 
 @inline
-def _tensors(table: Table, place: int) -> tuple[Any, Any, Any, Any]:
-    """p, g, m and v from ``place`` on."""
-    p, g = vector(table, place, float32), vector(table, place + 1, float32)
-    return p, g, vector(table, place + 2, float32), vector(table, place + 3, float32)
+def _tensors(table: Table, start: int) -> tuple[Any, Any, Any, Any]:
+    """p, g, m and v from ``start`` on."""
+    p, g = vector(table, start, float32), vector(table, start + 1, float32)
+    return p, g, vector(table, start + 2, float32), vector(table, start + 3, float32)
 
 
 @kernel
@@ -194,8 +194,8 @@ def keep_edges(
 ) -> None:
     """Copy what a block reads of the blocks beside it, which may be updated before.
 
-    Tasks ``(E, 4)``: job, first element of a block, elements of a slab, place in what is written; the slabs before
-    these blocks, the first of these; then p of each job.
+    Tasks ``(E, 4)``: job, first element of a block, elements of a slab, first element in what is
+    written; the slabs before these blocks, the first of these; then p of each job.
     """
     p = vector(table, 3 + parts[task, 0], float32)
     at, slab, to = parts[task, 1], parts[task, 2], parts[task, 3]
@@ -216,9 +216,9 @@ def grid_step(
     """Update a block of slabs with terms that look at neighbours.
 
     Constants ``(jobs, 11)``, shapes ``(jobs, 3)``: slabs, nodes, inner; tasks ``(tasks, 5)``: job, first element of its
-    slabs, first and last slab, place of the edges behind it; sums ``(tasks, 4)``, what `keep_edges` wrote; then p, g, m
-    and v of each job. A slab is updated as soon as the differences of the next one are known, as these still need its
-    old values; what lies in other blocks was copied beforehand.
+    slabs, first and last slab, first element of the edges behind it; sums ``(tasks, 4)``, what `keep_edges` wrote; then
+    p, g, m and v of each job. A slab is updated as soon as the differences of the next one are known, as
+    these still need its old values; what lies in other blocks was copied beforehand.
     """
     job, begin, first, last, edge = (
         parts[task, 0], parts[task, 1], parts[task, 2], parts[task, 3], parts[task, 4],

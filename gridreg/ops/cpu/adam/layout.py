@@ -1,4 +1,4 @@
-"""How a fused Adam step sees grids, and how it is shared out among tasks."""
+"""Layouts of grids in a fused Adam step, and its division into tasks."""
 
 from __future__ import annotations
 
@@ -48,12 +48,12 @@ def layout(shape: tuple[int, ...], spatial: tuple[int, ...]) -> Layout | None:
 
 
 class Form(NamedTuple):
-    """How the kernels see a parameter and its terms.
+    """A parameter and its terms, as the kernels see them.
 
     Args:
         layout: of the tensors.
-        apart: places of terms that they cannot take.
-        columns: by place, the columns of the kernels' sums that make the value of a term.
+        apart: numbers of terms that they cannot take.
+        columns: by number of the term, the columns of the kernels' sums that make the value of a term.
         counts: by column, what the sum is divided by.
     """
 

@@ -41,19 +41,19 @@ class _Plan(NamedTuple):
 
     def finish(self, sums: Sequence[float]) -> None:
         """Set the values of the terms, from the kernels' sums."""
-        for place, columns in self.form.columns.items():
+        for number, columns in self.form.columns.items():
             mean = sum(sums[column] / self.form.counts[column] for column in columns)
-            self.values[place] = self.step.terms[place].scale * mean
+            self.values[number] = self.step.terms[number].scale * mean
 
 
 def _plan(step: AdamStep) -> _Plan:
     """Plan a step; terms that the kernels cannot take are added to the gradient at once."""
     form = form_of(tuple(step.p.shape), tuple((term.kind, axes_of(term)) for term in step.terms))
     factors, values = [0.0, 0.0, 0.0, step.decay], [0.0] * len(step.terms)
-    for place in form.apart:
-        values[place] = add_term(step.terms[place], step.g)
-    for place, columns in form.columns.items():
-        term = step.terms[place]
+    for number in form.apart:
+        values[number] = add_term(step.terms[number], step.g)
+    for number, columns in form.columns.items():
+        term = step.terms[number]
         for column in columns:
             factors[column] += term.scale * (1 if term.kind == "l1" else 2) / form.counts[column]
     return _Plan(step, form, Factors(*factors), values)

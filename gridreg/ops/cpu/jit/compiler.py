@@ -1,4 +1,4 @@
-"""How kernels are compiled, and how they read their arguments.
+"""Compilation of kernels, and of the functions that they call.
 
 A kernel is a function of a task's number and of typed arguments::
 
@@ -70,12 +70,12 @@ class Kernel:
 
     @property
     def name(self) -> str:
-        """Of module and function, as its files in the cache begin."""
+        """Module and function, as its files in the cache begin."""
         return f"{self.function.__module__.rpartition('.')[2]}.{self.function.__name__}"
 
     @property
     def _folder(self) -> str:
-        """Of the cache, which need not exist."""
+        """The cache's folder, which need not exist."""
         cache = FunctionCache(self.function)  # type: ignore[no-untyped-call]
         return str(cache.cache_path)
 
@@ -97,7 +97,7 @@ class Kernel:
                 with one_process(folder, "gridreg-kernels"):
                     empty = forget_outdated(folder)
                 if empty and can_lock() and self.function.__module__.startswith(_OPERATIONS):
-                    _compile_ahead()
+                    _precompile()
                 with one_process(folder, self.name):
                     return compiled(cache=True)(serving)
             except (RuntimeError, OSError):
@@ -153,11 +153,11 @@ def _serving(function: Callable[..., None]) -> Callable[[Any], None]:
 
 
 @functools.cache
-def _compile_ahead() -> None:
+def _precompile() -> None:
     # Here, as that module uses this one.
-    from gridreg.ops.cpu.jit import precompile as ahead
+    from gridreg.ops.cpu.jit import precompile
 
-    ahead.start()
+    precompile.start()
 
 
 def inline(function: Callable[..., Any]) -> Any:

@@ -74,7 +74,7 @@ def _python_team() -> _Team:
 
 
 def runtime() -> str:
-    """Where threads come from: ``"openmp"`` (torch's own runtime) or ``"python"`` (a pool of Python threads)."""
+    """The source of threads: ``"openmp"`` (torch's own runtime) or ``"python"`` (a pool of Python threads)."""
     if "team" not in _state:
         team = _openmp_team()
         _state["name"], _state["team"] = ("openmp", team) if team is not None else ("python", _python_team())

@@ -1,4 +1,4 @@
-"""Faint samples that share a colour: what is in a pool, and that nothing changes in expectation."""
+"""Low-weight samples that share a colour: what is in a group, and that nothing changes in expectation."""
 
 from __future__ import annotations
 
@@ -28,21 +28,21 @@ def packed(draw: st.DrawFn) -> tuple[Tensor, Tensor]:
 
 
 @given(samples=packed(), bound=st.sampled_from([1e-3, 1e-2, 0.3]), seed=st.none() | st.integers(0, 99))
-def test_pools_are_runs_of_faint_neighbours_on_one_ray(samples, bound, seed):
+def test_groups_are_runs_of_low_weight_neighbours_on_one_ray(samples, bound, seed):
     weights, rays = samples
-    speakers, pools = merge_neighbours(weights, rays, bound, None if seed is None else seeded(seed))
-    assert pools.shape == weights.shape
-    # Every pool has its speaker among its members, and pools follow one another.
-    assert torch.equal(pools[speakers], torch.arange(len(speakers)))
-    assert torch.equal(pools.unique_consecutive(), torch.arange(len(speakers)))
-    for number in range(len(speakers)):
-        members = (pools == number).nonzero().squeeze(-1)
+    representatives, groups = merge_neighbours(weights, rays, bound, None if seed is None else seeded(seed))
+    assert groups.shape == weights.shape
+    # Every group has its representative among its members, and groups follow one another.
+    assert torch.equal(groups[representatives], torch.arange(len(representatives)))
+    assert torch.equal(groups.unique_consecutive(), torch.arange(len(representatives)))
+    for number in range(len(representatives)):
+        members = (groups == number).nonzero().squeeze(-1)
         assert len(rays[members].unique()) == 1
         if len(members) > 1:
             assert bool((weights[members] < bound).all())
             assert float(weights[members].double().sum()) < 2 * bound
-    # Two faint neighbours stay apart only where a pool is full.
-    assert len(speakers) <= len(weights)
+    # Two low-weight neighbours stay apart only where a group is full.
+    assert len(representatives) <= len(weights)
 
 
 @given(
@@ -50,7 +50,7 @@ def test_pools_are_runs_of_faint_neighbours_on_one_ray(samples, bound, seed):
     bounds=st.sampled_from([(1e-4, 0.0), (1e-4, 1e-3), (1e-3, 1e-2), (0.0, 0.3), (1e-2, 1e-2)]),
     seed=st.none() | st.integers(0, 99),
 )
-def test_compiled_pools_are_the_plain_ones(samples, bounds, seed):
+def test_compiled_groups_are_the_plain_ones(samples, bounds, seed):
     weights, rays = samples
     offsets = torch.zeros(10, dtype=torch.int64)
     offsets[1:] = torch.bincount(rays, minlength=9).cumsum(0)
@@ -60,39 +60,41 @@ def test_compiled_pools_are_the_plain_ones(samples, bounds, seed):
             found.append(ops.merge_samples(weights, offsets, *bounds, None if seed is None else seeded(seed)))
     for compiled, plain in zip(*found, strict=True):
         assert torch.equal(compiled, plain)
-    speakers, of_rays, pools = found[0]
-    assert torch.equal(of_rays, rays[speakers])
-    assert torch.equal(pools >= 0, weights > bounds[0])
+    representatives, of_rays, groups = found[0]
+    assert torch.equal(of_rays, rays[representatives])
+    assert torch.equal(groups >= 0, weights > bounds[0])
 
 
 @given(samples=packed(), floor=st.sampled_from([1e-4, 1e-2, 2.0]), channels=st.integers(1, 4))
-def test_colours_of_pools_and_their_gradients(samples, floor, channels):
+def test_colours_of_groups_and_their_gradients(samples, floor, channels):
     weights, rays = samples
     offsets = torch.zeros(9, dtype=torch.int64)
     offsets[1:] = torch.bincount(rays, minlength=8).cumsum(0)
-    speakers, _, pools = ops.merge_samples(weights, offsets, floor, 0.1)
-    colours = torch.rand(len(speakers), channels, generator=seeded()).requires_grad_()
+    representatives, _, groups = ops.merge_samples(weights, offsets, floor, 0.1)
+    colours = torch.rand(len(representatives), channels, generator=seeded()).requires_grad_()
     upstream = torch.rand(len(weights), channels, generator=seeded(1))
     found = []
     for name in ("compiled", "torch"):
         with ops.use_backend(name):
-            out = ops.spread_to_samples(colours, pools, speakers)
+            out = ops.spread_to_samples(colours, groups, representatives)
             found.append((out.detach(), *torch.autograd.grad(out, colours, upstream)))
     torch.testing.assert_close(found[0][0], found[1][0], rtol=0, atol=0)
     torch.testing.assert_close(found[0][1], found[1][1])
 
 
 def test_no_samples():
-    speakers, pools = merge_neighbours(torch.empty(0), torch.empty(0, dtype=torch.int64), 0.1, seeded())
-    assert speakers.shape == pools.shape == (0,)
+    representatives, groups = merge_neighbours(
+        torch.empty(0), torch.empty(0, dtype=torch.int64), 0.1, seeded()
+    )
+    assert representatives.shape == groups.shape == (0,)
 
 
-def test_speakers_are_drawn_in_proportion_to_weight():
+def test_representatives_are_drawn_in_proportion_to_weight():
     weights, rays = torch.tensor([1e-4, 3e-4, 6e-4]), torch.zeros(3, dtype=torch.int64)
     generator, count = seeded(), torch.zeros(3)
     for _ in range(4000):
-        speakers, _ = merge_neighbours(weights, rays, 1e-2, generator)
-        count[speakers] += 1
+        representatives, _ = merge_neighbours(weights, rays, 1e-2, generator)
+        count[representatives] += 1
     # Standard error of a share: below 0.008.
     torch.testing.assert_close(count / 4000, torch.tensor([0.1, 0.3, 0.6]), atol=0.035, rtol=0)
 
@@ -121,31 +123,31 @@ def rays_down(count: int) -> Rays:
     return Rays(origins, torch.tensor([0.0, 0.0, -1.0]).expand_as(origins).contiguous())
 
 
-def picture(field: Fog, pool: float, generator: torch.Generator | None) -> Tensor:
-    march = MarchSettings(0.01, weight_bound=1e-4, transmittance_bound=0.0, merge_weight=pool)
+def image(field: Fog, merge_weight: float, generator: torch.Generator | None) -> Tensor:
+    march = MarchSettings(0.01, weight_bound=1e-4, transmittance_bound=0.0, merge_weight=merge_weight)
     grid = OccupancyGrid.full(field.bounds, (8, 8, 8))
     return render_rays(
         field, rays_down(16), grid, march, background=torch.ones(3), generator=generator
     ).colour
 
 
-def test_the_mean_of_many_draws_is_the_picture_without_pools():
+def test_the_mean_of_many_draws_is_the_image_without_merging():
     field = Fog()
-    exact = picture(field, 0.0, seeded()).detach()
+    exact = image(field, 0.0, seeded()).detach()
     generator = seeded()
-    draws = torch.stack([picture(field, 0.02, generator).detach() for _ in range(300)])
+    draws = torch.stack([image(field, 0.02, generator).detach() for _ in range(300)])
     error = (draws.mean(0) - exact).abs()
     assert float(draws.std(0).min()) > 0
     assert bool((error < 5 * draws.std(0) / 300**0.5 + 1e-6).all())
-    # One draw differs by the spread of colours within pools of 2 %: half a percent of white here.
+    # One draw differs by the spread of colours within groups of 2 %: half a percent of white here.
     assert float((draws - exact).square().mean().sqrt()) < 0.005
 
 
-def test_the_mean_gradient_of_colours_is_the_one_without_pools():
+def test_the_mean_gradient_of_colours_is_the_one_without_merging():
     field = Fog()
 
-    def gradient(pool: float, generator: torch.Generator) -> Tensor:
-        found = torch.autograd.grad(picture(field, pool, generator).square().sum(), field.tint)[0]
+    def gradient(merge_weight: float, generator: torch.Generator) -> Tensor:
+        found = torch.autograd.grad(image(field, merge_weight, generator).square().sum(), field.tint)[0]
         return found / 16
 
     exact, generator = gradient(0.0, seeded()), seeded()
@@ -156,14 +158,14 @@ def test_the_mean_gradient_of_colours_is_the_one_without_pools():
 
 def test_fewer_colours_are_asked_for():
     field = Fog()
-    picture(field, 0.0, seeded())
+    image(field, 0.0, seeded())
     every, field.asked = field.asked, 0
-    picture(field, 0.02, seeded())
+    image(field, 0.02, seeded())
     assert 0 < field.asked < every / 3
 
 
 def test_a_ray_does_not_depend_on_its_company():
-    """Without a generator pools have the speaker at half of their weight, whatever else is rendered with the ray."""
+    """Without a generator a group's representative lies at half of its weight, whatever else is rendered."""
     field, march = Fog(), MarchSettings(0.01, weight_bound=1e-4, transmittance_bound=0.0, merge_weight=0.02)
     grid, rays = OccupancyGrid.full(field.bounds, (8, 8, 8)), rays_down(16)
     together = render_rays(field, rays, grid, march, background=torch.ones(3)).colour
@@ -171,18 +173,18 @@ def test_a_ray_does_not_depend_on_its_company():
         some = Rays(rays.origins[start:stop], rays.directions[start:stop])
         apart = render_rays(field, some, grid, march, background=torch.ones(3)).colour
         assert torch.equal(apart, together[start:stop])
-    exact = picture(field, 0.0, None)
+    exact = image(field, 0.0, None)
     # As good as a draw, in this fog of colours that change quickly; never quite the same.
     assert 0 < float((together - exact).detach().square().mean().sqrt()) < 0.005
 
 
 def test_without_gradients_colours_come_in_blocks(monkeypatch):
     field = Fog()
-    every = picture(field, 0.0, None)
+    every = image(field, 0.0, None)
     monkeypatch.setattr(render, "_BLOCK", 100)
     sizes, whole = [], field.colour
     monkeypatch.setattr(field, "colour", lambda x, d: (sizes.append(len(x)), whole(x, d))[1])
     with torch.no_grad():
-        assert torch.equal(picture(field, 0.0, None), every)
+        assert torch.equal(image(field, 0.0, None), every)
     assert max(sizes) == 100
     assert len(sizes) > 2
