@@ -78,6 +78,8 @@ from gridreg.schedules import (
 )
 from gridreg.segments import optical_depth_to_weights
 
+__version__ = "0.1.0"
+
 __all__ = [
     "CauchySparsity",
     "Clock",

@@ -417,3 +417,16 @@ def test_nothing_is_pickled(tmp_path):
         assert not data.startswith(b"PK")
     header = (tmp_path / "c" / "tensors.safetensors").read_bytes()
     assert json.loads(header[8 : 8 + int.from_bytes(header[:8], "little")])["x"]["dtype"] == "F32"
+
+
+def test_a_checkpoint_behind_a_link(tmp_path):
+    """The link to a larger disk stays, and the checkpoint lies behind it."""
+    (tmp_path / "large" / "run").mkdir(parents=True)
+    link = tmp_path / "checkpoint"
+    link.symlink_to(tmp_path / "large" / "run", target_is_directory=True)
+    for step in range(3):
+        save_checkpoint(link, {"step": step, "x": torch.ones(3)})
+        assert load_checkpoint(link).state["step"] == step
+    assert link.is_symlink()
+    assert has_checkpoint(tmp_path / "large" / "run")
+    assert [p.name for p in (tmp_path / "large").iterdir()] == ["run"]

@@ -26,6 +26,7 @@ from gridreg.errors import InputError
 from gridreg.export import read_mesh
 from gridreg.scenes import builtin_scene
 from gridreg.training import load_run
+from gridreg.training.files import one_writer
 
 SMALL = [
     *("--steps", "60", "--no-video", "--no-mesh", "--set"),
@@ -320,3 +321,81 @@ def test_view_serves_until_it_is_stopped(desk: Path) -> None:
         assert served.wait(timeout=30) == 0
     assert said == f"viewer: http://127.0.0.1:{port} (reached from this machine only)\n"
     assert "Traceback" not in rest
+
+
+# --- output that cannot be written, names that a terminal would obey, wrong options
+
+MESH = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
+
+
+def shell(line: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    (folder / "a.obj").write_text(MESH)
+    command = f"{sys.executable} -m gridreg compare-mesh a.obj a.obj --samples 10 {line}"
+    return subprocess.run(
+        ["bash", "-c", command], cwd=folder, capture_output=True, text=True, env=ENVIRONMENT
+    )
+
+
+ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
+
+
+@pytest.mark.parametrize(("line", "status"), [("", 0), (">&-", 0), (">&- 2>&-", 0), ("| true", 0)])
+def test_closed_output_is_no_traceback(line: str, status: int, tmp_path: Path) -> None:
+    done = shell(line, tmp_path)
+    assert (done.returncode, done.stderr) == (status, "")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no full device")
+def test_a_full_disk_behind_the_output_is_one_line(tmp_path: Path) -> None:
+    done = shell(">/dev/full", tmp_path)
+    assert done.returncode == 2
+    assert done.stderr == "error: standard output: cannot write: No space left on device\n"
+
+
+def test_names_are_escaped_where_they_are_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    def program() -> int:
+        print("title \x1b]0;owned\a of \udcff\r, \x1b[1mbold\x1b[0m and ü³─")
+        return 0
+
+    assert run_cli(program) == 0
+    assert capsys.readouterr().out == "title \\x1b]0;owned\\x07 of \\udcff\\r, \x1b[1mbold\x1b[0m and ü³─\n"
+    assert main(["train", "--scene", "a\nb\x1b[2J"]) == 2
+    text = capsys.readouterr().err
+    assert len(text.splitlines()) == 1
+    assert "a\\nb\\x1b[2J" in text
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (
+            ["train", "--stepz", "3"],
+            "--stepz, 3; did you mean --steps?; see gridreg train --help",
+        ),
+        (["train", "--steps", "abc"], "--steps"),
+        (["eval"], "RUN"),
+        (["render", "run", "--modes", "rbg"], "Expected one of ('rgb', 'depth', 'opacity')"),
+    ],
+)
+def test_a_wrong_option_is_one_line(
+    words: list[str], expected: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(words) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: ")
+    assert expected in line
+
+
+def test_a_second_run_in_one_folder_is_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    with one_writer(tmp_path):
+        scene = next(Path().glob("*/transforms_train.json")).parent
+        words = ["train", "--scene", str(scene), "--out", str(tmp_path), *SMALL]
+        child = subprocess.run(
+            [sys.executable, "-m", "gridreg", *words],
+            capture_output=True,
+            text=True,
+            env=ENVIRONMENT,
+            check=False,
+        )
+    assert child.returncode == 2
+    assert "another run is writing here" in child.stderr

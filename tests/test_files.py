@@ -208,3 +208,45 @@ def test_remove_folder(tmp_path):
     files.remove_folder(tmp_path / "gone")
     files.remove_folder(tmp_path / "gone")
     assert list(tmp_path.iterdir()) == []
+
+
+def run(code: str, *arguments: object) -> subprocess.CompletedProcess[str]:
+    """A child process with the module at hand."""
+    code = (
+        "import os, signal, sys\nfrom pathlib import Path\nfrom gridreg.training import files\n"
+        + textwrap.dedent(code)
+    )
+    return subprocess.run([sys.executable, "-c", code, *map(str, arguments)], capture_output=True, text=True)
+
+
+def test_what_a_killed_process_left_goes_with_the_next_run(tmp_path):
+    done = run(
+        """
+        with files.writing(Path(sys.argv[1]) / "mesh.ply") as temporary:
+            files.temporary_beside(Path(sys.argv[1]) / "frames").mkdir()
+            temporary.write_bytes(b"part")
+            os.kill(os.getpid(), signal.SIGKILL)
+        """,
+        tmp_path,
+    )
+    assert done.returncode == -9
+    assert len(list(tmp_path.iterdir())) == 2
+    strangers = [".mesh.00000000-1-0123abcd.tmp.ply", ".mesh.tmp.ply", ".notes.tmp"]
+    for name in strangers:
+        (tmp_path / name).touch()
+    # What another machine is writing, or a living process, is left alone.
+    with files.writing(tmp_path / "own.txt") as temporary:
+        temporary.touch()
+        files.check_output_folder(tmp_path)
+        assert sorted(p.name for p in tmp_path.iterdir()) == sorted([*strangers, temporary.name])
+
+
+def test_one_writer_keeps_others_out_and_dies_with_its_process(tmp_path):
+    with files.one_writer(tmp_path):
+        done = run("with files.one_writer(sys.argv[1]): print('in')", tmp_path)
+        assert done.stdout == ""
+        assert "another run is writing here" in done.stderr
+    assert list(tmp_path.iterdir()) == []
+    killed = run("with files.one_writer(sys.argv[1]): os.kill(os.getpid(), signal.SIGKILL)", tmp_path)
+    assert killed.returncode == -9
+    assert run("with files.one_writer(sys.argv[1]): print('in')", tmp_path).stdout == "in\n"

@@ -192,11 +192,23 @@ def test_the_first_signal_asks_and_the_second_aborts(capfd):
     assert capfd.readouterr().err.count("stopping after this step and saving") == 1
 
 
-def test_termination_is_a_request_as_well():
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_termination_and_a_closed_terminal_are_requests_as_well(number):
     with interruptible() as interruption:
-        os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), number)
         assert interruption.requested
-    assert interruption.exit_status == 143
+    assert interruption.exit_status == 128 + number
+
+
+def test_a_closed_terminal_under_nohup_is_none():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with interruptible() as interruption:
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert not interruption.requested
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def test_handlers_come_back_after_an_exception():

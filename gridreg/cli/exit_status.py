@@ -1,34 +1,110 @@
-"""How every program of gridreg ends: what bad input and Ctrl-C look like, in one place."""
+"""How every program of gridreg ends: what bad input, Ctrl-C and a full disk look like, in one place."""
 
 from __future__ import annotations
 
 import os
+import re
 import sys
 from collections.abc import Callable
+from typing import Any, TextIO
 
-from gridreg.errors import InputError
+from gridreg.errors import InputError, one_line
 
 __all__ = ["run_cli"]
 
+_OF_TRAIN = {
+    "PIL",
+    "imageio",
+    "imageio_ffmpeg",
+    "jinja2",
+    "llvmlite",
+    "matplotlib",
+    "numba",
+    "safetensors",
+    "scipy",
+    "skimage",
+}
+_OF_TRAIN |= {"tqdm", "trimesh", "tyro"}
+# Line breaks that a program prints on purpose, and colours, are the only controls that reach a terminal.
+_CONTROL = re.compile(r"\x1b\[[0-9;]*m|[^\S\n\t ]|[^\w\s\x20-\x7e]")
+
+
+class _Output:
+    """Standard output or error that takes whatever is printed to it and never ends the program.
+
+    Closed, it takes text and drops it. What its encoding has not got, and on standard output whatever a terminal would
+    obey, is escaped: names come from files of others. An error of the disk behind it is kept for the end.
+
+    Args:
+        stream: what stood there; None if it was closed.
+        escape: whether control characters are escaped; live lines of progress have some.
+    """
+
+    def __init__(self, stream: TextIO | None, *, escape: bool) -> None:
+        self.stream: TextIO = open(os.devnull, "w", encoding="utf-8") if stream is None else stream  # noqa: SIM115
+        self.escape = escape
+        self.error: OSError | None = None
+
+    def write(self, text: str) -> int:
+        if self.escape:
+            text = _CONTROL.sub(
+                lambda m: m[0] if m[0].isprintable() or m[0][-1] == "m" else one_line(m[0]), text
+            )
+        encoding = getattr(self.stream, "encoding", None) or "utf-8"
+        self._try(self.stream.write, text.encode(encoding, "backslashreplace").decode(encoding))
+        return len(text)
+
+    def flush(self) -> None:
+        self._try(self.stream.flush)
+
+    def _try(self, act: Callable[..., Any], *arguments: Any) -> None:
+        try:
+            act(*arguments)
+        except BrokenPipeError:
+            raise
+        except OSError as error:
+            self.error = error
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.stream, name)
+
 
 def run_cli(program: Callable[[], int]) -> int:
-    """Run a program and give the exit status of what became of it.
+    """Run a program and return the exit status of what became of it.
 
-    Bad input is one line ``error: ...`` on standard error and status 2, Ctrl-C one line and status 130. Anything else
-    that is raised is a defect and keeps its traceback.
+    Bad input is one line ``error: ...`` on standard error and status 2, and so is output that could not be written;
+    Ctrl-C is one line and status 130. Anything else that is raised is a defect and keeps its traceback.
 
     Example:
         >>> run_cli(lambda: 0)
         0
     """
-    # Nothing here draws on a screen; what a notebook sets for its own process is often not installed beside us.
-    os.environ["MPLBACKEND"] = "agg"
+    before = sys.stdout, sys.stderr
+    output = _Output(sys.stdout, escape=True)
+    sys.stdout, sys.stderr = output, _Output(sys.stderr, escape=False)  # type: ignore[assignment]
+    try:
+        status = _status_of(program)
+        if output.error is not None:
+            print(f"error: standard output: cannot write: {output.error.strerror}", file=sys.stderr)
+            # The interpreter must not try once more.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        return status if output.error is None else status or 2
+    finally:
+        sys.stdout, sys.stderr = before
+
+
+def _status_of(program: Callable[[], int]) -> int:
     try:
         status = program()
         sys.stdout.flush()
         return status
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
+        return 2
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] not in _OF_TRAIN:
+            raise
+        print(f"error: {error.name} is not installed: pip install 'gridreg[train]'", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)

@@ -9,9 +9,9 @@ import importlib
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib import metadata
 from typing import Annotated, Any, Union
 
+import gridreg
 from gridreg.cli.exit_status import run_cli
 from gridreg.errors import InputError, near_names
 
@@ -82,7 +82,7 @@ def _main(words: list[str]) -> int:
         print(overview())
         return 0
     if words[0] in ("-V", "--version"):
-        print(f"gridreg {metadata.version('gridreg')}")
+        print(f"gridreg {gridreg.__version__}")
         return 0
     if words[0] in _COMPLETION:
         return _completion(words)
@@ -94,9 +94,9 @@ def _main(words: list[str]) -> int:
     if name == "bench":
         # What follows the name of a benchmark is the benchmark's own.
         return int(run(rest))
-    import tyro
+    from gridreg.cli.arguments import parse_options
 
-    return int(run(tyro.cli(options_of(name), args=rest, prog=f"gridreg {name}")) or 0)
+    return int(run(parse_options(options_of(name), rest, f"gridreg {name}")) or 0)
 
 
 def options_of(name: str) -> Any:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import secrets
 import shutil
 import subprocess
 import tempfile
@@ -17,7 +16,7 @@ import numpy as np
 from PIL import Image
 
 from gridreg.errors import InputError
-from gridreg.training.files import check_output_folder, output_errors, writing
+from gridreg.training.files import check_output_folder, output_errors, temporary_beside, writing
 from gridreg.training.images import ImageArray
 
 __all__ = ["check_target", "find_ffmpeg", "write_video"]
@@ -145,8 +144,7 @@ def _writing_folder(path: Path) -> Iterator[Path]:
     others = [p.name for p in path.iterdir() if not p.match("frame_*.png")] if path.is_dir() else []
     if others:
         raise InputError(f"{path}: holds {others[0]!r}, expected a new folder or one of frames alone")
-    token = f"{os.getpid()}-{secrets.token_hex(4)}"
-    temporary, old = path.with_name(f".{path.name}.{token}.tmp"), path.with_name(f".{path.name}.{token}.old")
+    temporary, old = temporary_beside(path), temporary_beside(path)
     with output_errors(path):
         try:
             temporary.mkdir()

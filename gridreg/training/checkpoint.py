@@ -163,8 +163,9 @@ def has_checkpoint(folder: str | os.PathLike[str]) -> bool:
 
 def _names(folder: str | os.PathLike[str]) -> tuple[Path, Path, Path]:
     folder = Path(folder)
-    if not folder.name:
-        folder = folder.resolve()
+    # Of a link to a larger disk, what it leads to is replaced, on that disk, and the link stays.
+    if not folder.name or folder.is_symlink():
+        folder = Path(os.path.realpath(folder))
     # Hidden, because somebody may well keep a copy under a name like checkpoint.old.
     return folder, folder.with_name(f".{folder.name}.new"), folder.with_name(f".{folder.name}.old")
 

@@ -17,7 +17,7 @@ from gridreg.training.checkpoint import has_checkpoint
 from gridreg.training.config import save_yaml, to_data
 from gridreg.training.curves import History, draw_curves, draw_masks
 from gridreg.training.evaluate import Scored, mean_psnr_of, score_views
-from gridreg.training.files import check_output_folder
+from gridreg.training.files import check_output_folder, one_writer
 from gridreg.training.outputs import save_contact_sheet, save_scored
 from gridreg.training.progress import Interruption, Progress, interruptible
 from gridreg.training.record import metrics_record, save_metrics
@@ -220,37 +220,45 @@ def execute(
         The execution, and the metrics, or None if it was interrupted (its checkpoint is saved).
 
     Raises:
-        InputError: for an unusable folder or checkpoint, or a training that has died.
+        InputError: for an unusable folder or checkpoint, a folder that another run writes to, or a training that has
+            died.
     """
     folder = check_output_folder(out)
-    checkpoint = folder / "checkpoint"
-    if has_checkpoint(checkpoint) and not resume:
-        raise InputError(
-            f"{folder}: holds a run already; resume it with --resume, or choose another output folder"
+    with one_writer(folder):
+        checkpoint = folder / "checkpoint"
+        if has_checkpoint(checkpoint) and not resume:
+            raise InputError(
+                f"{folder}: holds a run already; resume it with --resume, or choose another output folder"
+            )
+        began = time.perf_counter()
+        if resume:
+            trainer, record = resume_trainer(checkpoint, config, scene)
+            history, times = History(), dict(record["seconds"])
+            history.load_state_dict(record["history"])
+        else:
+            trainer, history, times = (
+                build_trainer(config, scene),
+                History(max(1, config.train.steps // 200)),
+                {},
+            )
+        times["setup"] = times.get("setup", 0.0) + time.perf_counter() - began
+        run = Execution(config, scene, folder, trainer, history, times)
+        if watch is not None:
+            watch.start(run)
+        save_yaml(
+            folder / "config.yaml",
+            config,
+            comment="Everything that determines this run; pass it with --config.",
         )
-    began = time.perf_counter()
-    if resume:
-        trainer, record = resume_trainer(checkpoint, config, scene)
-        history, times = History(), dict(record["seconds"])
-        history.load_state_dict(record["history"])
-    else:
-        trainer, history, times = build_trainer(config, scene), History(max(1, config.train.steps // 200)), {}
-    times["setup"] = times.get("setup", 0.0) + time.perf_counter() - began
-    run = Execution(config, scene, folder, trainer, history, times)
-    if watch is not None:
-        watch.start(run)
-    save_yaml(
-        folder / "config.yaml", config, comment="Everything that determines this run; pass it with --config."
-    )
-    with interruptible() as interruption:
-        with Progress(config.train.steps, start=trainer.step) as progress:
-            finished = run.train(progress, interruption, _both(on_step, watch))
-        if not finished:
-            print(f"stopped at step {trainer.step}; go on with --resume --out {folder}", file=sys.stderr)
-            return run, None
-        with Progress(len(scene.test), label="test view") as progress:
-            scored = run.score(progress, interruption)
-    return run, run.record(scored, command)
+        with interruptible() as interruption:
+            with Progress(config.train.steps, start=trainer.step) as progress:
+                finished = run.train(progress, interruption, _both(on_step, watch))
+            if not finished:
+                print(f"stopped at step {trainer.step}; go on with --resume --out {folder}", file=sys.stderr)
+                return run, None
+            with Progress(len(scene.test), label="test view") as progress:
+                scored = run.score(progress, interruption)
+        return run, run.record(scored, command)
 
 
 def _both(on_step: Any, watch: Watch | None) -> Any:

@@ -11,8 +11,11 @@ from __future__ import annotations
 import errno
 import json
 import os
+import platform
+import re
 import secrets
 import shutil
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,11 +23,18 @@ from typing import Any
 
 from gridreg.errors import InputError
 
+try:
+    import fcntl
+except ImportError:  # Windows has no such lock.
+    fcntl = None  # type: ignore[assignment]
+
 __all__ = [
     "check_output_folder",
     "flush",
+    "one_writer",
     "output_errors",
     "remove_folder",
+    "temporary_beside",
     "write_bytes",
     "write_json",
     "write_text",
@@ -79,8 +89,7 @@ def writing(path: str | os.PathLike[str]) -> Iterator[Path]:
         'whole'
     """
     path = Path(path)
-    # A token, not a fixed name: workers of one experiment may write the same file at the same time.
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}-{secrets.token_hex(4)}.tmp{path.suffix}")
+    temporary = temporary_beside(path)
     with output_errors(path):
         try:
             yield temporary
@@ -89,6 +98,85 @@ def writing(path: str | os.PathLike[str]) -> Iterator[Path]:
         except BaseException:
             temporary.unlink(missing_ok=True)
             raise
+
+
+def temporary_beside(path: Path) -> Path:
+    """A hidden name beside ``path`` that nobody else uses, and that tells later runs whose it is.
+
+    A process that is killed leaves its file; `check_output_folder` takes it away once that process is gone.
+    """
+    # A token, not a fixed name: workers of one experiment may write the same file at the same time.
+    token = f"{_machine()}-{os.getpid()}-{secrets.token_hex(4)}"
+    return path.with_name(f".{path.stem}.{token}.tmp{path.suffix}")
+
+
+_TEMPORARY = re.compile(r"\..*\.([0-9a-f]{8})-(\d+)-[0-9a-f]{8}\.tmp(\..*)?", re.DOTALL)
+
+
+def _machine() -> str:
+    """Eight characters that differ between machines that share a disk: processes of others cannot be looked up."""
+    return f"{zlib.crc32(platform.node().encode('utf-8', 'surrogateescape')):08x}"
+
+
+def _remove_left_behind(folder: Path) -> None:
+    """Remove temporary files of processes of this machine that have died."""
+    for entry in list(folder.iterdir()):
+        found = _TEMPORARY.fullmatch(entry.name)
+        if found is not None and found[1] == _machine() and not _lives(int(found[2])):
+            if entry.is_dir() and not entry.is_symlink():
+                shutil.rmtree(entry, ignore_errors=True)
+            else:
+                entry.unlink(missing_ok=True)
+
+
+def _lives(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except OSError:
+        # Somebody else's, or a system that does not tell.
+        return True
+    return True
+
+
+@contextmanager
+def one_writer(folder: str | os.PathLike[str]) -> Iterator[None]:
+    """Hold a folder for one process; the hold dies with the process, whatever ends it.
+
+    Where files cannot be locked (Windows, some network disks), nobody is kept out.
+
+    Raises:
+        InputError: if another process holds it, or the place is not writable.
+    """
+    if fcntl is None:
+        yield
+        return
+    place = Path(folder) / ".writer"
+    with output_errors(folder):
+        while True:
+            lock = place.open("a+")
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                lock.close()
+                raise InputError(
+                    f"{os.fspath(folder)}: another run is writing here; wait for it, or choose another output folder"
+                ) from None
+            except OSError:
+                break
+            try:
+                if place.stat().st_ino == os.fstat(lock.fileno()).st_ino:
+                    break
+            except FileNotFoundError:
+                pass
+            # Whoever held it has taken the file away since it was opened here.
+            lock.close()
+    try:
+        yield
+    finally:
+        place.unlink(missing_ok=True)
+        lock.close()
 
 
 def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
@@ -129,6 +217,8 @@ def write_json(path: str | os.PathLike[str], value: Any, *, sort_keys: bool = Tr
 def check_output_folder(path: str | os.PathLike[str]) -> Path:
     """Create the folder if need be and prove that it can be written to, before hours of work depend on it.
 
+    Temporary files that a killed process left in it are removed.
+
     Returns:
         The folder as a ``Path``.
 
@@ -138,7 +228,8 @@ def check_output_folder(path: str | os.PathLike[str]) -> Path:
     folder = Path(path)
     with output_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        probe = folder / f".probe.{os.getpid()}-{secrets.token_hex(4)}.tmp"
+        _remove_left_behind(folder)
+        probe = temporary_beside(folder / "probe")
         try:
             # Some bytes, because an empty file still fits on a full disk.
             probe.write_bytes(b"\0" * 4096)

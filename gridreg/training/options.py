@@ -12,6 +12,7 @@ import tyro
 
 from gridreg.errors import InputError
 from gridreg.training.config import assignments, from_yaml, override
+from gridreg.training.files import one_writer
 from gridreg.training.presets import load_preset, preset_names
 from gridreg.training.settings import RunConfig
 
@@ -22,6 +23,8 @@ _Folder = Annotated[Path | None, tyro.conf.arg(metavar="DIR", help_behavior_hint
 _File = Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")]
 _Name = Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")]
 _Number = Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="")]
+
+_MOST_STEPS, _MOST_THREADS = 10**9, 4096
 
 
 @dataclass
@@ -98,12 +101,13 @@ def configure(options: TrainOptions) -> RunConfig:
         # Whoever looks at the run later may stand in another folder.
         config = replace(config, scene=os.path.abspath(config.scene))
     if options.steps is not None:
-        if options.steps < 1:
-            raise InputError(f"--steps: found {options.steps}, expected at least 1")
+        if not 1 <= options.steps <= _MOST_STEPS:
+            bound = "at least 1" if options.steps < 1 else f"at most {_MOST_STEPS:,}"
+            raise InputError(f"--steps: found {options.steps:.6g}, expected {bound}")
         config = replace(config, train=config.train.scaled(options.steps))
     if options.threads is not None:
-        if options.threads < 1:
-            raise InputError(f"--threads: found {options.threads}, expected at least 1")
+        if not 1 <= options.threads <= _MOST_THREADS:
+            raise InputError(f"--threads: found {options.threads}, expected 1 to {_MOST_THREADS}")
         torch.set_num_threads(options.threads)
     return config
 
@@ -116,6 +120,17 @@ def _preset_of(backbone: str, like: str) -> RunConfig | None:
     return found[names[0]] if names else None
 
 
+def _is_taken(folder: Path) -> bool:
+    """Whether a folder holds a run, or one that has only begun."""
+    if (folder / "checkpoint").exists() or not folder.is_dir():
+        return folder.exists()
+    try:
+        with one_writer(folder):
+            return False
+    except InputError:
+        return True
+
+
 def output_folder(options: TrainOptions, config: RunConfig) -> Path:
     """Where the run goes: as told, or a folder of its own below ``outputs``."""
     if options.out is not None:
@@ -125,7 +140,7 @@ def output_folder(options: TrainOptions, config: RunConfig) -> Path:
     scene = "builtin" if config.scene is None else Path(config.scene).resolve().name
     base = Path("outputs") / f"{scene}-{config.preset or 'run'}"
     number, found = 1, base
-    while (found / "checkpoint").exists():
+    while _is_taken(found):
         number += 1
         found = base.with_name(f"{base.name}-{number}")
     return found

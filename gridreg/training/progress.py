@@ -158,6 +158,11 @@ def _shown(name: str, value: float) -> str:
     return f"PSNR {value:.2f} dB" if name == "psnr" else f"{name} {value:.4g}"
 
 
+_STOPPING = tuple(
+    signal.Signals[name] for name in ("SIGINT", "SIGTERM", "SIGHUP") if name in signal.Signals.__members__
+)
+
+
 class Interruption:
     """Whether somebody asked the run to stop; read ``requested`` after every step.
 
@@ -178,9 +183,9 @@ class Interruption:
 
 @contextmanager
 def interruptible(
-    signals: Sequence[signal.Signals] = (signal.SIGINT, signal.SIGTERM),
+    signals: Sequence[signal.Signals] = _STOPPING,
 ) -> Iterator[Interruption]:
-    """Turn the first Ctrl-C (or SIGTERM) inside into a request; the second one raises ``KeyboardInterrupt``.
+    """Turn the first Ctrl-C, SIGTERM or SIGHUP inside into a request; the second one raises ``KeyboardInterrupt``.
 
     Save inside the block, so that the second one can still cut the saving short. Outside the main thread,
     where Python allows no signal handlers, the request never comes.
@@ -212,6 +217,9 @@ def interruptible(
     before: dict[signal.Signals, Any] = {}
     try:
         for number in signals:
+            # Under nohup a closed terminal is no reason to stop.
+            if number != signal.SIGINT and signal.getsignal(number) is signal.SIG_IGN:
+                continue
             before[number] = signal.signal(number, handle)
         yield interruption
     finally:

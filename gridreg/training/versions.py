@@ -8,11 +8,12 @@ from pathlib import Path
 
 import torch
 
+import gridreg
 from gridreg.cores import usable_cores
 
 __all__ = ["cpu_model", "package_version", "versions"]
 
-_PACKAGES = ("gridreg", "torch", "numpy", "numba")
+_PACKAGES = ("torch", "numpy", "numba")
 
 
 def versions() -> dict[str, str | int]:
@@ -26,7 +27,8 @@ def versions() -> dict[str, str | int]:
         >>> sorted(versions())[:3]
         ['cores', 'cpu', 'gridreg']
     """
-    found: dict[str, str | int] = {name: package_version(name) for name in _PACKAGES}
+    found: dict[str, str | int] = {"gridreg": gridreg.__version__}
+    found.update({name: package_version(name) for name in _PACKAGES})
     found["python"] = platform.python_version()
     found["platform"] = platform.platform()
     found["cpu"] = cpu_model()
