@@ -45,8 +45,9 @@ class Basis(nn.Linear):
 class MLPDecoder(nn.Module):
     """An MLP ``width-width-3`` on features, direction and position, each with its positional encoding.
 
-    The columns of the first weight are ``[features | direction | position]``, each block ordered octave by octave, so a
-    mask on an encoding is a mask on columns of that weight: the same function, at the cost of a small matrix.
+    The columns of the first weight are ``[features | direction | position]``, each block ordered octave by
+    octave, so a mask on an encoding is a mask on columns of that weight: the same function, at the cost of a
+    small matrix.
 
     Args:
         features: appearance features ``F`` (27 in TensoRF).
@@ -112,7 +113,7 @@ class MLPDecoder(nn.Module):
         return torch.sigmoid(out)
 
     def _open(self, blocks: list[ops.Block]) -> tuple[list[ops.Block], Tensor]:
-        """The encodings without the octaves that masks have closed altogether, and the weight's columns for them."""
+        """Encodings without the octaves that masks have closed altogether, and the weight's columns for them."""
         parts, columns, start = [], [], 0
         for block in blocks:
             stop = start + block.width
@@ -152,7 +153,7 @@ class MLPDecoder(nn.Module):
 
 
 class SHDecoder(nn.Module):
-    """Spherical harmonics of degree 2 with 9 coefficients per colour (PlenOctrees section 3; TensoRF "SH")."""
+    """Spherical harmonics of degree 2, 9 coefficients per colour (PlenOctrees section 3; TensoRF "SH")."""
 
     bands = 3
 
@@ -191,7 +192,7 @@ class RGBDecoder(nn.Module):
         return torch.sigmoid(features)
 
     def sites(self, prefix: str) -> dict[str, Site]:
-        """None: there is nothing to mask."""
+        """No sites: there is nothing to mask."""
         return {}
 
 
@@ -236,8 +237,8 @@ def make_decoder(name: str, features: int | None = None, **options: Any) -> tupl
     """A decoder by name, and the number of features it reads.
 
     Args:
-        name: ``mlp_fea`` (TensoRF MLP_Fea), ``mlp_pe`` (MLP_PE), ``mlp`` (Few TensoRF: position 6, direction 6,
-            feature 2 octaves), ``sh`` or ``rgb``.
+        name: ``mlp_fea`` (TensoRF MLP_Fea), ``mlp_pe`` (MLP_PE), ``mlp`` (Few TensoRF: position 6, direction
+            6, feature 2 octaves), ``sh`` or ``rgb``.
         features: that it reads; None: its own default.
         options: of its constructor, such as ``width`` and ``precision`` of the MLPs.
 

@@ -1,4 +1,4 @@
-"""Samples where a first look found something: coarse and fine sampling of rays (NeRF, section 5.2)."""
+"""Coarse and fine sampling of rays, hierarchical sampling (NeRF, section 5.2)."""
 
 from __future__ import annotations
 
@@ -60,10 +60,11 @@ def inverse_transform(
 
 
 def intervals(t: Tensor, t_min: Tensor, t_max: Tensor) -> Tensor:
-    """The part of its ray that each sample stands for: from half-way to the one before to half-way to the next.
+    """Length of ray that each sample stands for: from half-way to the one before to half-way to the next.
 
-    NeRF gives each sample the way to the next one, and the last one 1e10; so what lies before the first is left out,
-    and the last is opaque as soon as its density is not 0. Here the lengths add up to that of the ray.
+    NeRF gives each sample the way to the next one, and the last one 1e10; so what lies before the first is
+    left out, and the last is opaque as soon as its density is not 0. Here the lengths add up to that of the
+    ray.
 
     Args:
         t: ``(R, S)``, rising.

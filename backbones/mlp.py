@@ -25,31 +25,34 @@ _CHUNK = 1 << 15
 
 
 class MLPField(nn.Module):
-    """Density and colour from one network: ``depth`` layers of ``width`` units that see the position again half-way.
+    """Density and colour from one network of ``depth`` layers, which sees the position again half-way.
 
-    Position and direction enter by positional encodings, which FreeNeRF masks: sites ``encoding.position`` and
-    ``encoding.direction``, columns of the weights that read them, with the octave of each.
+    Position and direction enter by positional encodings, which FreeNeRF masks: sites ``encoding.position``
+    and ``encoding.direction``, columns of the weights that read them, with the octave of each.
 
-    Rays are sampled twice: evenly, and where the first look found something. FreeNeRF's program for the synthetic
-    scenes has a network for each look (NeRF); here one network serves both, as in mip-NeRF, and the first look is
-    taken without gradient: what is composited, and learned from, is the union of both, so that a step costs
-    ``coarse_samples`` less than NeRF's per ray, and half the parameters.
+    Rays are sampled twice: evenly, and where the first look found something. FreeNeRF's program for the
+    synthetic scenes has a network for each look (NeRF); here one network serves both, as in mip-NeRF, and the first
+    look is taken without gradient: what is composited, and learned from, is the union of both, so that a step
+    costs ``coarse_samples`` less than NeRF's per ray, and half the parameters.
 
-    Density is ``softplus(f(x) + shift)``, with ``f`` 0 everywhere before training. NeRF's ReLU has no gradient where it
-    is 0 and in some runs never starts, which its programs cure by training on the middle of the pictures at first.
+    Density is ``softplus(f(x) + shift)``, with ``f`` 0 everywhere before training. NeRF's ReLU has no
+    gradient where it is 0 and in some runs never starts, which its programs cure by training on the middle of
+    the images at first.
 
     Args:
-        bounds: ``(2, 3)``, world units. Encodings see positions from its centre, in thirds of its longest edge: world
-            coordinates in the box [-1.5, 1.5]^3 of the synthetic scenes.
+        bounds: ``(2, 3)``, world units. Encodings see positions from its centre, in thirds of its longest
+            edge: world coordinates in the box [-1.5, 1.5]^3 of the synthetic scenes.
         resolution: of grids; a network has none, and ignores it.
         width, depth: of the trunk (256 and 8 in NeRF).
-        skip: the layer after which the encoded position is put beside the hidden units again (4 in NeRF), from 0.
+        skip: the layer after which the encoded position is put beside the hidden units again (4 in NeRF),
+            from 0.
         colour_width: of the layer that sees the direction (128 in NeRF).
-        position_octaves, direction_octaves: 10 and 4, as NeRF and FreeNeRF's program for the synthetic scenes. (Its
-            program for real scenes is mip-NeRF's, where 16 octaves of the position are averaged over cones.)
+        position_octaves, direction_octaves: 10 and 4, as NeRF and FreeNeRF's program for the synthetic
+            scenes. (Its program for real scenes is mip-NeRF's, where 16 octaves of the position are averaged
+            over cones.)
         coarse_samples, fine_samples: per ray (64 and 128 in NeRF).
-        initial_opacity: of a ray along the mean edge of the box before training. (mip-NeRF's shift of -1 makes 0.6 of
-            it in the synthetic scenes.)
+        initial_opacity: of a ray along the mean edge of the box before training. (mip-NeRF's shift of -1
+            makes 0.6 of it in the synthetic scenes.)
         precision: of the matrix products on the CPU, see `gridreg.ops.mlp`.
         generator: for the initial weights.
 
@@ -178,8 +181,8 @@ class MLPField(nn.Module):
     ) -> RayMarchResult:
         """Coarse and fine samples of rays, and the density at all of them.
 
-        The coarse samples are evenly spread, and looked at without gradient; the fine ones follow their weights (NeRF,
-        section 5.2). Samples in empty cells count as density 0 at both looks.
+        The coarse samples are evenly spread, and looked at without gradient; the fine ones follow their
+        weights (NeRF, section 5.2). Samples in empty cells count as density 0 at both looks.
 
         Args:
             rays: ``R`` rays.
@@ -190,8 +193,8 @@ class MLPField(nn.Module):
             transmittance_bound: not used: what is hidden is known only once it is evaluated.
 
         Returns:
-            The union of both looks. Where gradients are wanted, its features are the hidden units, so that the trunk is
-            not computed again for the colour.
+            The union of both looks. Where gradients are wanted, its features are the hidden units, so that
+            the trunk is not computed again for the colour.
         """
         with torch.no_grad():
             t = self._distances(rays, t_min, t_max, occupancy, jitter)
@@ -255,7 +258,7 @@ def _pairs(layers: Any) -> list[tuple[Tensor, Tensor | None]]:
 
 
 def _placed(rays: Rays, t: Tensor, met: Tensor, occupancy: OccupancyGrid) -> tuple[Tensor, Tensor]:
-    """Positions ``(R, S, 3)`` of samples at distances ``(R, S)``, and which of them may hold something ``(R, S)``."""
+    """Positions ``(R, S, 3)`` of samples at distances ``(R, S)``, and whether they may hold something."""
     positions = rays.origins[:, None] + t[..., None] * rays.directions[:, None]
     kept = occupancy.contains(positions.reshape(-1, 3)).reshape(t.shape)
     return positions, kept & met[:, None]

@@ -1,4 +1,5 @@
-"""Matrix products in kernels: rounding to bfloat16, processors with fewer registers or without instructions for it."""
+"""Matrix products in kernels: rounding to bfloat16, processors with fewer registers or without instructions
+for it."""
 
 from __future__ import annotations
 

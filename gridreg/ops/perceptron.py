@@ -1,8 +1,9 @@
 """Multi-layer perceptrons, on positional encodings or on numbers as they are.
 
-The compiled version takes rows from their encodings through all layers in one kernel, and back in another. Its products
-are float32, or bfloat16 with float32 sums: a value is then off by at most 2^-7 of the largest, and gradients by 4 % in
-norm at random weights, most of that from units at the edge of their ReLU, without bias. Weights stay float32.
+The compiled version takes rows from their encodings through all layers in one kernel, and back in another.
+Its products are float32, or bfloat16 with float32 sums: a value is then off by at most 2^-7 of the largest,
+and gradients by 4 % in norm at random weights, most of that from units at the edge of their ReLU, without
+bias. Weights stay float32.
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ def _check_precision(precision: str) -> None:
 
 @operation(check=_check_precision)
 def product_dtype(precision: Precision) -> torch.dtype:
-    """Precision in which products of float32 tensors on the CPU are computed; the plain versions know float32 alone.
+    """Precision in which the CPU multiplies float32 tensors; the plain versions know float32 alone.
 
     Raises:
         InputError: for an unknown precision.
@@ -102,8 +103,8 @@ def encoded_mlp(blocks: _Blocks, layers: _Layers, *, precision: Precision = "aut
     """Linear layers with ReLU between them, on the positional encodings of several inputs, side by side.
 
     Args:
-        blocks: inputs; each is encoded in the order "octave", itself first. One alone and without octaves may be of
-            `product_dtype`, and then its gradient is.
+        blocks: inputs; each is encoded in the order "octave", itself first. One alone and without octaves may
+            be of `product_dtype`, and then its gradient is.
         layers: pairs of weight ``(out, in)`` and bias ``(out,)`` or None; the first reads all encodings.
         precision: of products; taken into account on the CPU, in float32, for layers of up to 512 units.
 

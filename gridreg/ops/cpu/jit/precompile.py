@@ -1,9 +1,9 @@
 """A second process that compiles kernels while the first one does, from the other end.
 
-A run compiles what it uses, in the order in which it uses it, and numba compiles one function at a time. Where the
-cache is empty, the process that finds it so starts another one, which begins with what a run needs last and ends where
-both meet: on two processors a first run waits little more than half as long. What neither of the two needs is not
-compiled.
+A run compiles what it uses, in the order in which it uses it, and numba compiles one function at a time.
+Where the cache is empty, the process that finds it so starts another one, which begins with what a run needs
+last and ends where both meet: on two processors a first run waits little more than half as long. What neither
+of the two needs is not compiled.
 """
 
 from __future__ import annotations
@@ -21,8 +21,9 @@ from gridreg.ops.cpu.mlp.gemm_tile import has
 __all__ = ["main", "start"]
 
 _SWITCH = "GRIDREG_COMPILE_AHEAD"
-# Of a run with a VM field, from the one that it compiles last.
-_ORDER = (
+# Of a run with a VM field, from the one that it compiles last. Of two, the first is for processors that
+# multiply bfloat16, the second for others.
+_ORDER: tuple[str | tuple[str, str], ...] = (
     "cpu.vm._density",
     "cpu.adam.kernels.flat_step",
     "cpu.adam.kernels.grid_step",
@@ -31,17 +32,15 @@ _ORDER = (
     "cpu.reductions._round",
     "cpu.reductions._measure",
     "cpu.composite._weights_backward",
-    "cpu.vm_gradient._bf16_features_backward",
+    ("cpu.vm_gradient._bf16_features_backward", "cpu.vm_gradient._features_backward"),
     "cpu.counting_sort._sort",
     "cpu.reductions._reduce",
-    "cpu.mlp.kernels.backward_bf16",
-    "cpu.mlp.kernels.backward_f32",
+    ("cpu.mlp.kernels.backward_bf16", "cpu.mlp.kernels.backward_f32"),
     "cpu.merging._gather",
     "cpu.composite._pixels_backward",
     "cpu.composite._pixels_forward",
     "cpu.merging._spread",
-    "cpu.mlp.kernels.forward_bf16",
-    "cpu.mlp.kernels.forward_f32",
+    ("cpu.mlp.kernels.forward_bf16", "cpu.mlp.kernels.forward_f32"),
 )
 
 
@@ -76,10 +75,10 @@ def _stop(helper: subprocess.Popen[bytes]) -> None:
 
 def main() -> None:
     """Compile until there is a kernel that another process has compiled."""
-    for name in _ORDER:
+    native = has("avx512bf16")
+    for entry in _ORDER:
+        name = entry if isinstance(entry, str) else entry[0 if native else 1]
         module, _, function = name.rpartition(".")
-        if function.endswith("_f32" if has("avx512bf16") else "_bf16"):
-            continue
         kernel = getattr(importlib.import_module(f"gridreg.ops.{module}"), function)
         if kernel.cached:
             break

@@ -51,20 +51,20 @@ def _write_octaves(
 
 @inline
 def encode_rows(
-    table: Any, place: int, blocks: int, first: int, rows: int, encoded: Any, width: int, write: Any
+    table: Any, first_argument: int, blocks: int, first: int, rows: int, encoded: Any, width: int, write: Any
 ) -> None:
     """Write the encodings of some rows, and zeros behind them.
 
     Args:
-        table: of the kernel; from ``place`` on x, rows, dims and octaves of each block.
+        table: of the kernel; from ``first_argument`` on x, rows, dims and octaves of each block.
         encoded: ``width`` wide; the last vector that is written may reach beyond its block.
         write: eight float32 to it.
     """
     start = int64(0)
     for block in range(blocks):
-        where = place + PER_BLOCK * block
-        x, row_of = vector(table, where, float32), vector(table, where + 1, int64)
-        dims, octaves = integer(table, where + 2), integer(table, where + 3)
+        argument = first_argument + PER_BLOCK * block
+        x, row_of = vector(table, argument, float32), vector(table, argument + 1, int64)
+        dims, octaves = integer(table, argument + 2), integer(table, argument + 3)
         by_row = row_of.shape[0] > 0
         for n in range(first, first + rows):
             source, to = (row_of[n] if by_row else n) * dims, n * width + start
@@ -101,19 +101,20 @@ def _read_octaves(
 
 @inline
 def decode_rows(
-    table: Any, place: int, blocks: int, first: int, rows: int, encoded: Any, width: int, gradient: Any, wider: int
+    table: Any, first_argument: int, blocks: int, first: int, rows: int, encoded: Any, width: int,
+    gradient: Any, wider: int,
 ) -> None:  # fmt: skip
     """Write gradients of the inputs, from those of the encodings.
 
     Args:
-        table: of the kernel; from ``place`` on result, first column, dims and octaves of each block.
+        table: of the kernel; from ``first_argument`` on result, first column, dims and octaves of each block.
         encoded: ``width`` wide.
         gradient: of the encodings, from the first of these rows on, ``wider`` wide.
     """
     for block in range(blocks):
-        where = place + PER_BLOCK * block
-        result, column = vector(table, where, float32), integer(table, where + 1)
-        dims, octaves = integer(table, where + 2), integer(table, where + 3)
+        argument = first_argument + PER_BLOCK * block
+        result, column = vector(table, argument, float32), integer(table, argument + 1)
+        dims, octaves = integer(table, argument + 2), integer(table, argument + 3)
         if result.shape[0] == 0:
             continue
         split = dims - dims % LANES

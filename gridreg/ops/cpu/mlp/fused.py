@@ -1,7 +1,7 @@
 """A perceptron on positional encodings as one operation of autograd: a kernel forward, a kernel backward.
 
-Layer by layer a small network spends a third of its time between products. Gradients of weights are summed by a fixed
-number of tasks, so that they do not depend on the number of threads.
+Layer by layer a small network spends a third of its time between products. Gradients of weights are summed by
+a fixed number of tasks, so that they do not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _KERNELS = {
 
 
 def padded_rows(count: int) -> int:
-    """Rows to allocate, so that whole tiles can be read from the first row of any task of the backward pass on."""
+    """Rows to allocate, so that whole tiles can be read from any row on at which a task begins."""
     return round_up(count, TILE_ROWS) + TILE_ROWS
 
 
@@ -100,14 +100,14 @@ def gradients(
         arguments += [results[-1] if need else none, end, dims, octaves]
         end += width
         columns = end if need else columns
-    place, places = 0, []
+    start, of_layers = 0, []
     for number, (weight, x) in enumerate(zip(weights, inputs, strict=True)):
         high = round_up(len(weight), 16)
         back = weight if number else weight[:, :columns]
-        places.append((place, place + high * x.shape[1], high, x.shape[1]))
-        arguments += [pack(back.t(), high, dtype) if back.shape[1] else none, x, place]
-        place += high * (x.shape[1] + 1)
-    sums = workspace("perceptron", TASKS, place)
+        of_layers.append((start, start + high * x.shape[1], high, x.shape[1]))
+        arguments += [pack(back.t(), high, dtype) if back.shape[1] else none, x, start]
+        start += high * (x.shape[1] + 1)
+    sums = workspace("perceptron", TASKS, start)
     first = kernels.BackwardArguments(
         rows=count,
         blocks=len(blocks),
@@ -122,7 +122,7 @@ def gradients(
     launch(_KERNELS[dtype][1], TASKS, *first, *arguments)
     found = reduce_sum(sums)
     flat: list[Tensor] = []
-    for weight, (begin, middle, high, width) in zip(weights, places, strict=True):
+    for weight, (begin, middle, high, width) in zip(weights, of_layers, strict=True):
         of_weight = found[begin:middle].view(high, width)
         flat += [of_weight[: len(weight), : weight.shape[1]], found[middle : middle + len(weight)]]
     return results, flat
@@ -144,8 +144,8 @@ class _Perceptron(Function):
             rows = none if block.rows is None else block.rows.contiguous()
             arguments += [_whole_vectors(block.x), rows, block.x.shape[1], block.octaves]
         inputs, weights = [encoded], []
-        for place in range(0, len(flat), 2):
-            weight, bias = flat[place], flat[place + 1]
+        for number in range(len(flat) // 2):
+            weight, bias = flat[2 * number : 2 * number + 2]
             assert weight is not None
             weights.append(weight.detach())
             columns = round_up(len(weight), 16)
@@ -153,10 +153,10 @@ class _Perceptron(Function):
             if bias is not None:
                 added[: len(bias)] = bias.detach()
             output = encoded
-            if place + 2 < len(flat):
+            if 2 * number + 2 < len(flat):
                 output = torch.empty(padded_rows(count), columns, dtype=dtype)
                 inputs.append(output)
-            arguments += [pack(weight, inputs[place // 2].shape[1], dtype), added, output]
+            arguments += [pack(weight, inputs[number].shape[1], dtype), added, output]
         out = torch.empty(padded_rows(count), round_up(len(weights[-1]), 16))
         first = kernels.ForwardArguments(
             rows=count, blocks=len(blocks), layers=len(weights), encoded=encoded, out=out
@@ -186,5 +186,5 @@ def _encoded_mlp(blocks: Sequence[Any], layers: Sequence[Any], *, precision: Pre
 
 @product_dtype.register_cpu()
 def _product_dtype(precision: Precision) -> torch.dtype:
-    low = precision == "bfloat16" or (precision == "auto" and has("avx512bf16"))
-    return torch.bfloat16 if low else torch.float32
+    rounds = precision == "bfloat16" or (precision == "auto" and has("avx512bf16"))
+    return torch.bfloat16 if rounds else torch.float32

@@ -189,9 +189,9 @@ def round_to_bf16(context: Any, array: Any, index: Any, value: Any) -> Any:
 
 @inline
 def _pair_rows(x: Any, width: int, first: int, rows: int, out: Any, across: int, down: int) -> None:
-    """Write pairs of rows of x as pairs of bfloat16: pair p, column i at ``(i // 16) across + p down + i % 16``.
+    """Write rows of x as pairs of bfloat16, two rows each; the width is a multiple of 16.
 
-    The width is a multiple of 16.
+    Pair p, column i stands at ``(i // 16) across + p down + i % 16``.
     """
     for p in range(-(-rows // 2)):
         upper = (first + 2 * p) * width

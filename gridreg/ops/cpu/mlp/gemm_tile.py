@@ -1,9 +1,12 @@
 """Register tiles: LLVM IR for a block of a matrix product that stays in registers while it is summed up.
 
-A tile has some rows and 16 or 32 columns; how many follows from the registers that the processor has. Each step of
-its sum takes one number of every row, in float32, or a pair of numbers, in bfloat16, whose products are summed in
-float32: by one instruction where the processor has it (AVX-512 BF16), else by two multiply-adds. At its end stands an
-epilogue: what a layer does with the sum before it is written.
+A tile has some rows and 16 or 32 columns; how many follows from the registers that the processor has. Each
+step of its sum takes one number of every row, in float32, or a pair of numbers, in bfloat16, whose products
+are summed in float32: by one instruction where the processor has it (AVX-512 BF16), else by two
+multiply-adds. At its end stands an epilogue: what a layer does with the sum before it is written.
+
+It is generated because numba's own loops do not keep a block of results in registers: they take several times
+as long.
 """
 
 from __future__ import annotations
@@ -37,7 +40,7 @@ COLUMNS = 16
 """Columns of a vector of results."""
 
 Epilogue: TypeAlias = Literal["accumulate", "bias", "relu", "relu_mask"]
-"""Add to what stands in the output; add one number a column; that and a ReLU; 0 where the argument is not positive."""
+"""Add to the output; add one number a column; that and a ReLU; 0 where the argument is not positive."""
 
 _INDEX, _WORD, _HALF = ir.IntType(64), ir.IntType(32), ir.IntType(16)
 _FLOATS, _WORDS = ir.VectorType(ir.FloatType(), COLUMNS), ir.VectorType(_WORD, COLUMNS)
@@ -72,7 +75,7 @@ class _BFloat(ir.types.Type):  # type: ignore[misc]
 
 
 class Arithmetic(NamedTuple):
-    """How a tile multiplies.
+    """Arithmetic of a tile.
 
     Args:
         word: LLVM type of what a row gives to a step.
@@ -136,7 +139,7 @@ def element(builder: Any, pointer: Any, index: Any, like: Any = _FLOATS) -> Any:
 
 
 def round_lanes(builder: Any, value: Any) -> Any:
-    """Eight or sixteen float32 rounded to bfloat16; subnormal numbers become 0 where the processor does it."""
+    """Float32 rounded to bfloat16; by the processor's instruction, if it has it, which flushes subnormals."""
     if not _NATIVE:
         return bf16_bits(builder, value)
     lanes = value.type.count
@@ -187,15 +190,18 @@ def _loop(
 
 
 class TileArguments(NamedTuple):
-    """Of a tile. What begins, and all distances of left and right, count in words; those of the output in elements.
+    """Arguments of a tile. Starts and distances of left and right count in words; those of the output in
+    elements.
 
     Args:
-        left, left_start, left_row, left_step: array; its word of the first row and step; distance of rows, of steps.
-        right, right_start, right_step, right_panel: array; its first vector; distance of steps, of vectors of a step.
+        left, left_start, left_row, left_step: array; its word of the first row and step; distance of rows, of
+            steps.
+        right, right_start, right_step, right_panel: array; its first vector; distance of steps, of vectors of
+            a step.
         steps: of the sum.
         out, out_start, out_row: array of float32 or, if of uint16, bfloat16; first element; distance of rows.
-        argument, argument_start: of the epilogue: a number a column from ``argument_start`` on; or, of a ReLU mask,
-            an array like the output, ``argument_start`` elements further on.
+        argument, argument_start: of the epilogue: a number a column from ``argument_start`` on; or, of a ReLU
+            mask, an array like the output, ``argument_start`` elements further on.
     """
 
     left: Any

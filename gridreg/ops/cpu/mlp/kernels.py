@@ -51,8 +51,9 @@ _FORWARD_TILE, _TILE = ROWS * WIDEST, GRADIENT_ROWS * WIDEST
 class ForwardArguments(NamedTuple):
     """First arguments of a forward kernel.
 
-    Behind them stand those of each block of encodings (`encode_rows`), and of each layer: packed weight, bias, output.
-    Without blocks the first layer reads what stands in ``encoded``, which then may end with the last row.
+    Behind them stand those of each block of encodings (`encode_rows`), and of each layer: packed weight,
+    bias, output. Without blocks the first layer reads what stands in ``encoded``, which then may end with the
+    last row.
     """
 
     rows: int
@@ -65,9 +66,10 @@ class ForwardArguments(NamedTuple):
 class BackwardArguments(NamedTuple):
     """First arguments of a backward kernel.
 
-    Behind them stand those of each block of encodings (`decode_rows`), and of each layer: packed transposed weight,
-    input, and where the sums for its weight and then its bias begin in a row of ``sums (tasks, S)``. Without blocks the
-    gradient of ``encoded`` is written as it is. ``columns``: of that gradient, as many as are wanted.
+    Behind them stand those of each block of encodings (`decode_rows`), and of each layer: packed transposed
+    weight, input, and where the sums for its weight and then its bias begin in a row of ``sums (tasks, S)``.
+    Without blocks the gradient of ``encoded`` is written as it is. ``columns``: of that gradient, as many as
+    are wanted.
     """
 
     rows: int

@@ -27,7 +27,7 @@ def _both(table) -> None:
             sine[i], cosine[i] = s, c
 
 
-def waves(x):
+def sine_and_cosine_of(x):
     sine, cosine = torch.empty_like(x), torch.empty_like(x)
     launch(_both, 1, x, sine, cosine)
     return sine, cosine
@@ -36,15 +36,15 @@ def waves(x):
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 30.0, 1e4, 1e6])
 def test_they_are_those_of_float64(scale):
     x = scale * (2 * torch.rand(10007, generator=torch.Generator().manual_seed(0)) - 1)
-    sine, cosine = waves(x)
+    sine, cosine = sine_and_cosine_of(x)
     np.testing.assert_allclose(sine.double(), x.double().sin(), atol=2e-7, rtol=0)
     np.testing.assert_allclose(cosine.double(), x.double().cos(), atol=2e-7, rtol=0)
 
 
 def test_multiples_of_a_quarter_turn_and_what_has_none():
     x = torch.cat([torch.arange(-40, 41) * (torch.pi / 2), torch.tensor([0.0, -0.0, 1e-40])]).float()
-    sine, cosine = waves(x)
+    sine, cosine = sine_and_cosine_of(x)
     np.testing.assert_allclose(sine.double(), x.double().sin(), atol=2e-7, rtol=0)
     np.testing.assert_allclose(cosine.double(), x.double().cos(), atol=2e-7, rtol=0)
-    for found in waves(torch.tensor([float("nan"), float("inf"), -float("inf")] * 5)):
+    for found in sine_and_cosine_of(torch.tensor([float("nan"), float("inf"), -float("inf")] * 5)):
         assert bool(found.isnan().all())
