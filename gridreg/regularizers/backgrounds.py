@@ -95,10 +95,6 @@ class RandomBackground(Regularizer):
 
     Raises:
         InputError: `per` is unknown.
-
-    Example:
-        >>> RandomBackground().per
-        'ray'
     """
 
     per: Literal["ray", "batch"] = "ray"
@@ -148,13 +144,6 @@ class ExpectedBackground(Regularizer):
     Formula: ``background = 1/2``, ``mean((o - a)^2) / 12`` over rays, ``o`` the opacity, ``a`` the pixel's alpha
     Unit: squared colour
     Source: the expectation of Instant-NGP's random backgrounds (Mueller et al. 2022); gridreg
-
-    Raises:
-        InputError: the weight is out of range.
-
-    Example:
-        >>> ExpectedBackground().needs()
-        ('target_opacity',)
     """
 
     weight: Numeric = 1.0

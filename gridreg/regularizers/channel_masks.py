@@ -111,9 +111,6 @@ class FixedMask(Mask):
     Formula: the first ``int(L visible_ratio)`` channels 1, the rest 0
     Unit: none
     Source: Few TensoRF, human-body runs with 0.8.
-
-    >>> FixedMask("appearance", visible_ratio=0.8).visible_ratio
-    0.8
     """
 
     visible_ratio: Numeric = 0.8
@@ -153,9 +150,6 @@ class CosineMask(Mask):
     Formula: ``(1 - cos(pi clamp(L t/T - k, 0, 1))) / 2`` for octave k
     Unit: none
     Source: BARF (Lin et al., ICCV 2021), equation 14; Nerfies (Park et al., ICCV 2021), equation 8.
-
-    >>> CosineMask("encoding.position", until=0.5).until
-    0.5
     """
 
     until: Numeric = 0.9

@@ -140,10 +140,6 @@ class OcclusionLoss(Regularizer):
 
     Raises:
         InputError: a number is out of range, both samples and distance are given, or `on` is unknown.
-
-    Example:
-        >>> OcclusionLoss(weight=0.01, distance=0.3).distance
-        0.3
     """
 
     weight: Numeric = 0.01
@@ -202,10 +198,6 @@ class CauchySparsity(Regularizer):
     Formula: ``sum log(1 + 2 density^2)`` over the samples
     Unit: none (density per world unit)
     Source: SNeRG (Hedman et al. 2021); on grids Plenoxels (Yu et al. 2022)
-
-    Example:
-        >>> CauchySparsity().weight
-        1e-11
     """
 
     weight: Numeric = 1e-11
@@ -231,10 +223,6 @@ class Eikonal(Regularizer):
     Formula: ``mean((|g| - 1)^2)`` over samples, ``g`` the derivative of the distance by the position
     Unit: none
     Source: IGR (Gropp et al. 2020), equation 2
-
-    Example:
-        >>> Eikonal().needs()
-        ('gradients',)
     """
 
     weight: Numeric = 0.1

@@ -141,10 +141,6 @@ class DepthPrior(Regularizer):
 
     Raises:
         InputError: a number is out of range, or the form is unknown.
-
-    Example:
-        >>> DepthPrior(form="ranking").needs()
-        ('target_depth',)
     """
 
     weight: Numeric = 0.05

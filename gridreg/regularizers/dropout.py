@@ -55,9 +55,6 @@ class ComponentDropout(Regularizer):
     Formula: each channel times ``0`` with probability p, else ``1 / (1 - p)``
     Unit: none
     Source: none for grids; DropGaussian (Park et al., CVPR 2025) does it to Gaussians with p = 0.2 t / T.
-
-    >>> ComponentDropout("density").p
-    Linear(start=0.0, end=0.2, until=1.0, begin=0)
     """
 
     train_only: ClassVar[bool] = True

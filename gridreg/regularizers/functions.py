@@ -114,10 +114,6 @@ class SamplesFunction(_FunctionPenalty):
 
     Raises:
         InputError: the function cannot be called or found, or samples have no such attribute.
-
-    Example:
-        >>> SamplesFunction("torch:square", "samples.gradients").needs()
-        ('gradients',)
     """
 
     where: str = "samples"
@@ -169,10 +165,6 @@ class GridFunction(_FunctionPenalty):
 
     Raises:
         InputError: the function cannot be called or found, or the site is not one.
-
-    Example:
-        >>> GridFunction("torch:square", "density").weight
-        1.0
     """
 
     site: SiteLike = "density"

@@ -91,13 +91,6 @@ class DistanceGradientScaling(Regularizer):
     Formula: gradients of density and colour times ``clamp((t / distance)^2, 0, 1)``
     Unit: none
     Source: Floaters No More (Philip and Deschaintre 2023)
-
-    Raises:
-        InputError: the distance is not above 0.
-
-    Example:
-        >>> DistanceGradientScaling(distance=2.0).distance
-        2.0
     """
 
     distance: Numeric = 1.0

@@ -151,13 +151,6 @@ class L2(Regularizer):
     Formula: ``sum over grids of mean(g^2)``
     Unit: squared unit of the grid
     Source: ridge regression (Hoerl and Kennard 1970)
-
-    Raises:
-        InputError: the site or the weight is not one.
-
-    Example:
-        >>> L2("appearance", weight=1e-3).weight
-        0.001
     """
 
     site: SiteLike
@@ -205,10 +198,6 @@ class Orthogonality(Regularizer):
 
     Raises:
         InputError: the site or the weight is not one; a grid has no spatial axes.
-
-    Example:
-        >>> Orthogonality("density").weight
-        0.01
     """
 
     site: SiteLike

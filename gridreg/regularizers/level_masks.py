@@ -36,9 +36,6 @@ class LevelMask(Mask):
     Formula: level l open if ``l < start + int((t - begin) / every)``
     Unit: none
     Source: Neuralangelo (Li et al., CVPR 2023), section 3.2: 4 levels, one more every 5,000 of 500,000 steps.
-
-    >>> LevelMask("hash", start=4, every=5000).features
-    2
     """
 
     start: Numeric = 4
@@ -108,9 +105,6 @@ class ViewDependenceMask(Mask):
     Formula: spherical bands ``>= bands`` 0
     Unit: none
     Source: SANeRF drops bands from 2 on.
-
-    >>> ViewDependenceMask("encoding.direction", bands=0).bands
-    0
     """
 
     bands: Numeric = 2

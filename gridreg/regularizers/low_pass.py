@@ -177,10 +177,6 @@ class GridBlur(_GridFilter):
 
     Raises:
         InputError: a number is out of range, or a grid has no spatial axes.
-
-    Example:
-        >>> GridBlur("density", until=0.3).start
-        0.15
     """
 
     site: SiteLike

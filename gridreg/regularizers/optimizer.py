@@ -83,10 +83,6 @@ class WeightDecay(Regularizer):
 
     Raises:
         InputError: the site or the decay is not one; the groups do not hold the site's parameters.
-
-    Example:
-        >>> WeightDecay("density").decay
-        0.2
     """
 
     site: SiteLike
@@ -141,10 +137,6 @@ class LearningRate(Regularizer):
     Raises:
         InputError: the site or the scale is not one; the groups lack a learning rate or the site's
             parameters.
-
-    Example:
-        >>> LearningRate("appearance", scale=0.5).scale
-        0.5
     """
 
     site: SiteLike

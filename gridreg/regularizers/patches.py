@@ -174,10 +174,6 @@ class NormalSmoothness(Regularizer):
     Formula: ``mean(|n_ij - n_{i+1,j}|_1 + |n_ij - n_{i,j+1}|_1)`` over patches, ``n`` the unit normal of a ray
     Unit: none
     Source: DN-Splatter (Turkulainen et al. 2024), normal smoothness; after UNISURF (Oechsle et al. 2021)
-
-    Example:
-        >>> NormalSmoothness().needs()
-        ('gradients', 'patch')
     """
 
     weight: Numeric = 0.01
@@ -207,10 +203,6 @@ class RayKL(Regularizer):
     Formula: ``mean(sum_i p_i log(p_i / q_i))`` over rays and their right neighbours
     Unit: nats
     Source: InfoNeRF (Kim et al. 2022), information gain reduction
-
-    Example:
-        >>> RayKL().weight
-        1e-05
     """
 
     weight: Numeric = 1e-5

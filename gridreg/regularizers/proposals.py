@@ -87,10 +87,6 @@ class ProposalLoss(Regularizer):
     Formula: ``mean(sum_i max(0, w_i - b_i)^2 / w_i)`` over rays, ``b_i`` the proposal's weight that overlaps sample i
     Unit: none
     Source: mip-NeRF 360 (Barron et al. 2022), equation 13
-
-    Example:
-        >>> ProposalLoss().needs()
-        ('proposals',)
     """
 
     weight: Numeric = 1.0

@@ -162,10 +162,6 @@ class OpacityEntropy(Regularizer):
     Formula: ``mean(-o log o - (1 - o) log(1 - o))`` over rays, ``o`` the opacity
     Unit: nats
     Source: DVGO (Sun et al. 2022), background entropy loss
-
-    Example:
-        >>> OpacityEntropy().weight
-        0.001
     """
 
     weight: Numeric = 1e-3
@@ -192,13 +188,6 @@ class RayEntropy(Regularizer):
     Formula: ``mean(-sum p log p)`` over rays with opacity > threshold, ``p = alpha / sum alpha``
     Unit: nats
     Source: InfoNeRF (Kim et al. 2022), ray entropy minimization
-
-    Raises:
-        InputError: the weight or the threshold is out of range.
-
-    Example:
-        >>> RayEntropy(threshold=0.2).threshold
-        0.2
     """
 
     weight: Numeric = 1e-3
@@ -235,10 +224,6 @@ class DistortionLoss(Regularizer):
 
     Raises:
         InputError: a number is out of range, only one of near and far is given, or far is not beyond near.
-
-    Example:
-        >>> DistortionLoss(near=2.0, far=6.0).far
-        6.0
     """
 
     weight: Numeric = 1e-3

@@ -59,13 +59,6 @@ class SampleSpaceAnnealing(Regularizer):
     Formula: ``[m + (near - m) eta, m + (far - m) eta]``, ``eta = clamp(t / T, start, 1)``
     Unit: world units
     Source: RegNeRF (Niemeyer et al. 2022), sample space annealing
-
-    Raises:
-        InputError: a number is out of range.
-
-    Example:
-        >>> SampleSpaceAnnealing().until
-        256
     """
 
     until: Numeric = 256

@@ -140,10 +140,6 @@ class TotalVariation(Regularizer):
 
     Raises:
         InputError: an argument is out of range; a grid has no spatial axes.
-
-    Example:
-        >>> TotalVariation("density", weight=0.01).weight
-        0.01
     """
 
     site: SiteLike
@@ -218,10 +214,6 @@ class TimeSmoothness(Regularizer):
 
     Raises:
         InputError: the site or the weight is not one; a grid has no such axis.
-
-    Example:
-        >>> TimeSmoothness("density", weight=0.1).axis
-        0
     """
 
     site: SiteLike
