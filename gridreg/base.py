@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 import torch
 from torch import Tensor
@@ -117,6 +118,15 @@ class LocalTerm:
     name: str = ""
 
 
+NOT_NEGATIVE = (0.0, float("inf"))
+"""A range for `within`."""
+
+
+def within(**ranges: tuple[float, float]) -> Mapping[str, tuple[float, float]]:
+    """Lowest and highest values by the name of a field: for `Regularizer.ranges`."""
+    return ranges
+
+
 @dataclass(frozen=True)
 class Regularizer:
     """Base of all regularizers: a frozen dataclass whose fields are its configuration.
@@ -128,6 +138,7 @@ class Regularizer:
         acts_on: the part of a declared site that `transform` acts on: "mask" (channel masks) or "grids"
             (low-passes).
         train_only: skip `transform` while the module that owns the tensor is in eval mode.
+        ranges: lowest and highest value of fields that are numbers or schedules; None is let through.
 
     Two fields have a meaning where a subclass has them: `weight` is the factor of its penalties, and
     `detach=True` says that `transform` leaves values as they are and changes only gradients.
@@ -135,13 +146,31 @@ class Regularizer:
 
     acts_on: ClassVar[Literal["mask", "grids"]] = "mask"
     train_only: ClassVar[bool] = False
+    ranges: ClassVar[Mapping[str, tuple[float, float]]] = {}
 
     def __post_init__(self) -> None:
-        """Refuse at once what can be refused before the first step: a site or a weight that is none."""
-        if getattr(self, "site", None) is not None:
+        """Refuse at once what can be refused before the first step.
+
+        Raises:
+            InputError: a site or weight that is none, a number outside its range, a text that is none of the choices.
+        """
+        known = self.__dataclass_fields__
+        # A site may be left out where its own default says so.
+        if "site" in known and (self.site is not None or known["site"].default is not None):  # type: ignore[attr-defined]
             check_site(self.site)  # type: ignore[attr-defined]
-        if "weight" in self.__dataclass_fields__:
+        if "weight" in known:
             check_weight(self.weight)  # type: ignore[attr-defined]
+        for name, (low, high) in self.ranges.items():
+            if getattr(self, name) is not None:
+                check_numeric(name, getattr(self, name), low, high)
+        for name, choices in _choices(type(self)).items():  # type: ignore[arg-type]
+            if getattr(self, name) not in choices:
+                *first, last = map(repr, choices)
+                raise InputError(f"{name}={getattr(self, name)!r}: expected {', '.join(first)} or {last}")
+
+    def now(self, name: str, context: Context) -> float:
+        """The number that a field stands for at the context's step; refused outside its range."""
+        return context.at(getattr(self, name), name, *self.ranges.get(name, (-float("inf"), float("inf"))))
 
     # --- where -------------------------------------------------------------------------------------
 
@@ -227,6 +256,16 @@ class Regularizer:
     def examples(cls, site: SiteLike) -> list[Regularizer]:
         """Instances for `gridreg.testing.check_regularizer`, at `site` where the class takes one."""
         return []
+
+
+@lru_cache
+def _choices(cls: type[Regularizer]) -> dict[str, tuple[str, ...]]:
+    """Fields that are one of several texts, by their annotation."""
+    try:
+        hints = get_type_hints(cls)
+    except NameError:  # Names that are imported for type checkers alone.
+        return {}
+    return {name: get_args(hint) for name, hint in hints.items() if get_origin(hint) is Literal}
 
 
 RegularizerClass = TypeVar("RegularizerClass", bound=type[Regularizer])

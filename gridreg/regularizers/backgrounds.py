@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from gridreg.attach.sites import SiteLike
-from gridreg.base import Context, Regularizer, register
+from gridreg.base import NOT_NEGATIVE, Context, Regularizer, register, within
 from gridreg.errors import InputError
 from gridreg.samples import RaySamples
-from gridreg.schedules import Numeric, check_numeric
+from gridreg.schedules import Numeric
 
 __all__ = [
     "ExpectedBackground",
@@ -99,12 +99,7 @@ class RandomBackground(Regularizer):
 
     per: Literal["ray", "batch"] = "ray"
     until: Numeric = 1.0
-
-    def __post_init__(self) -> None:
-        """Refuse at once what can be refused before the first step."""
-        check_numeric("until", self.until, low=0.0)
-        if self.per not in ("ray", "batch"):
-            raise InputError(f"per={self.per!r}: expected 'ray' or 'batch'")
+    ranges = within(until=NOT_NEGATIVE)
 
     def background(
         self, count: int, generator: torch.Generator, default: Tensor | None, context: Context
@@ -148,11 +143,7 @@ class ExpectedBackground(Regularizer):
 
     weight: Numeric = 1.0
     until: Numeric = 1.0
-
-    def __post_init__(self) -> None:
-        """Refuse at once what can be refused before the first step."""
-        super().__post_init__()
-        check_numeric("until", self.until, low=0.0)
+    ranges = within(until=NOT_NEGATIVE)
 
     def needs(self) -> tuple[str, ...]:
         """The alpha of the pixels."""

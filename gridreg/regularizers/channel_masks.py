@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from gridreg.attach.sites import Place, SiteLike
-from gridreg.base import Context, Regularizer, register
+from gridreg.base import Context, Regularizer, register, within
 from gridreg.errors import InputError
 from gridreg.regularizers import mask_functions as masks
 from gridreg.regularizers.mask_base import Mask
-from gridreg.schedules import Linear, Numeric, check_numeric, check_until, fixed_end
+from gridreg.schedules import Linear, Numeric, check_until, fixed_end
 
 __all__ = ["CosineMask", "FixedMask", "FrequencyMask"]
 
@@ -48,8 +48,6 @@ class FrequencyMask(Mask):
         """Refuse what no run could use."""
         super().__post_init__()
         check_until(self.until)
-        if self.variant not in ("block", "printed", "authors"):
-            raise InputError(f"variant={self.variant!r}: expected 'block', 'printed' or 'authors'")
         if self.block is not None and (isinstance(self.block, bool) or not self.block >= 1):
             raise InputError(f"block={self.block!r}: expected a number of channels, an int above 0, or None")
 
@@ -114,15 +112,11 @@ class FixedMask(Mask):
     """
 
     visible_ratio: Numeric = 0.8
-
-    def __post_init__(self) -> None:
-        """Refuse shares outside [0, 1]."""
-        super().__post_init__()
-        check_numeric("visible_ratio", self.visible_ratio, 0, 1)
+    ranges = within(visible_ratio=(0.0, 1.0))
 
     def rank_values(self, count: int, context: Context) -> Tensor:
         """Mask over ranks."""
-        return masks.fixed_mask(count, context.at(self.visible_ratio, "visible_ratio", 0, 1))
+        return masks.fixed_mask(count, self.now("visible_ratio", context))
 
     @classmethod
     def examples(cls, site: SiteLike) -> list[Regularizer]:

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from gridreg.attach.sites import SiteLike
-from gridreg.base import Context, Regularizer, register
+from gridreg.base import NOT_NEGATIVE, Context, Regularizer, register
 from gridreg.errors import InputError
 from gridreg.samples import RaySamples
-from gridreg.schedules import Numeric, check_numeric
+from gridreg.schedules import Numeric
 
 __all__ = ["CauchySparsity", "Eikonal", "OcclusionLoss", "cauchy_sparsity", "eikonal", "occlusion_loss"]
 
@@ -148,18 +148,13 @@ class OcclusionLoss(Regularizer):
     on: Literal["density", "weights"] = "density"
     colour_prior: Numeric | None = None
     near: Numeric | None = None
+    ranges = dict.fromkeys(("samples", "distance", "colour_prior", "near"), NOT_NEGATIVE)
 
     def __post_init__(self) -> None:
         """Refuse at once what can be refused before the first step."""
         super().__post_init__()
-        for name in ("samples", "distance", "colour_prior", "near"):
-            value = getattr(self, name)
-            if value is not None:
-                check_numeric(name, value, low=0.0)
         if self.samples is not None and self.distance is not None:
             raise InputError(f"samples={self.samples}, distance={self.distance}: expected one of them")
-        if self.on not in ("density", "weights"):
-            raise InputError(f"on={self.on!r}: expected 'density' or 'weights'")
 
     def needs(self) -> tuple[str, ...]:
         """Colours, for the prior."""
@@ -167,19 +162,8 @@ class OcclusionLoss(Regularizer):
 
     def penalty(self, samples: RaySamples, context: Context) -> Tensor:
         """`occlusion_loss` with the numbers of this step."""
-
-        def now(name: str) -> float | None:
-            value = getattr(self, name)
-            return None if value is None else context.at(value, name, low=0.0)
-
-        return occlusion_loss(
-            samples,
-            now("samples"),
-            distance=now("distance"),
-            on=self.on,
-            colour_prior=now("colour_prior"),
-            near=now("near"),
-        )
+        now = {n: None if getattr(self, n) is None else self.now(n, context) for n in self.ranges}
+        return occlusion_loss(samples, now.pop("samples"), on=self.on, **now)
 
     @classmethod
     def examples(cls, site: SiteLike) -> list[Regularizer]:

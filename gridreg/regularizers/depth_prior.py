@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from gridreg.attach.sites import SiteLike
-from gridreg.base import Context, Regularizer, register
+from gridreg.base import NOT_NEGATIVE, Context, Regularizer, register, within
 from gridreg.errors import InputError
 from gridreg.samples import RaySamples
-from gridreg.schedules import Numeric, check_numeric
+from gridreg.schedules import Numeric
 
 __all__ = ["DepthPrior", "depth_correlation", "depth_ranking", "depth_residual"]
 
@@ -146,13 +146,7 @@ class DepthPrior(Regularizer):
     weight: Numeric = 0.05
     form: Literal["pearson", "ranking", "scale_shift"] = "pearson"
     margin: Numeric = 1e-4
-
-    def __post_init__(self) -> None:
-        """Refuse at once what can be refused before the first step."""
-        super().__post_init__()
-        check_numeric("margin", self.margin, low=0.0)
-        if self.form not in ("pearson", "ranking", "scale_shift"):
-            raise InputError(f"form={self.form!r}: expected 'pearson', 'ranking' or 'scale_shift'")
+    ranges = within(margin=NOT_NEGATIVE)
 
     def needs(self) -> tuple[str, ...]:
         """The depth to compare with."""
@@ -162,7 +156,7 @@ class DepthPrior(Regularizer):
         """The form's function; pairs of the ranking change with the step."""
         if self.form == "ranking":
             offset = float(torch.rand((), generator=context.step_generator()))
-            return depth_ranking(samples, offset, context.at(self.margin, "margin", low=0.0))
+            return depth_ranking(samples, offset, self.now("margin", context))
         return depth_correlation(samples) if self.form == "pearson" else depth_residual(samples)
 
     @classmethod

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gridreg.attach.sites import SiteLike
-from gridreg.base import Context, Regularizer, register
+from gridreg.base import Context, Regularizer, register, within
 from gridreg.regularizers.mask_base import broadcast, remember, spread
 from gridreg.schedules import Linear, Numeric, check_numeric
 
@@ -61,23 +61,19 @@ class ComponentDropout(Regularizer):
 
     site: SiteLike
     p: Numeric = _RAMP
-
-    def __post_init__(self) -> None:
-        """Refuse what is not a site or a probability."""
-        super().__post_init__()
-        check_numeric("p", self.p, 0, _HIGHEST)
+    ranges = within(p=(0.0, _HIGHEST))
 
     def prepare(self, context: Context) -> None:
         """Draw the factors of this step."""
         if context.place is not None and context.place.channels is not None:
-            p = context.at(self.p, "p", 0, _HIGHEST)
+            p = self.now("p", context)
             # Drawn at p = 0 too, so that the random numbers that follow do not depend on p.
             factors = component_dropout(context.place.channels, p, context.generator)
             remember(context, "factors", spread(factors, context.place))
 
     def is_identity(self, context: Context) -> bool:
         """Nothing dropped."""
-        return context.at(self.p, "p", 0, _HIGHEST) == 0
+        return self.now("p", context) == 0
 
     def transform(self, value: Tensor, context: Context) -> Tensor:
         """Multiply the channels by their factors."""
@@ -86,7 +82,7 @@ class ComponentDropout(Regularizer):
 
     def value(self, context: Context) -> float:
         """Probability now."""
-        return context.at(self.p, "p", 0, _HIGHEST)
+        return self.now("p", context)
 
     @classmethod
     def examples(cls, site: SiteLike) -> list[Regularizer]:

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from gridreg.attach.sites import SiteLike
-from gridreg.base import Context, Regularizer, register
+from gridreg.base import NOT_NEGATIVE, Context, Regularizer, register, within
 from gridreg.errors import InputError
 from gridreg.samples import RaySamples
-from gridreg.schedules import Numeric, check_numeric
+from gridreg.schedules import Numeric
 from gridreg.segments import optical_depth_to_weights
 
 __all__ = ["DistanceGradientScaling", "scale_gradients_by_distance"]
@@ -94,20 +94,21 @@ class DistanceGradientScaling(Regularizer):
     """
 
     distance: Numeric = 1.0
+    ranges = within(distance=NOT_NEGATIVE)
 
     def __post_init__(self) -> None:
         """Refuse at once what can be refused before the first step."""
-        check_numeric("distance", self.distance, low=0.0)
+        super().__post_init__()
         if self.distance == 0:
             raise InputError(f"distance={self.distance}: expected a length above 0")
 
     def on_samples(self, samples: RaySamples, context: Context) -> RaySamples:
         """`scale_gradients_by_distance` with the distance of this step."""
-        return scale_gradients_by_distance(samples, context.at(self.distance, "distance", low=0.0))
+        return scale_gradients_by_distance(samples, self.now("distance", context))
 
     def value(self, context: Context) -> float:
         """Distance from which on gradients count in full."""
-        return context.at(self.distance, "distance", low=0.0)
+        return self.now("distance", context)
 
     @classmethod
     def examples(cls, site: SiteLike) -> list[Regularizer]:

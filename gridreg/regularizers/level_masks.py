@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from gridreg.attach.sites import Place, SiteLike
-from gridreg.base import Context, Regularizer, register
+from gridreg.base import NOT_NEGATIVE, Context, Regularizer, register, within
 from gridreg.errors import InputError
 from gridreg.regularizers import mask_functions as masks
 from gridreg.regularizers.mask_base import Mask
-from gridreg.schedules import Linear, Numeric, check_numeric, check_until, end_step, fixed_end
+from gridreg.schedules import Linear, Numeric, check_until, end_step, fixed_end
 
 __all__ = ["LevelMask", "ViewDependenceMask"]
 
@@ -42,11 +42,11 @@ class LevelMask(Mask):
     every: Numeric = 0.01
     begin: Numeric = 0
     features: int = 2
+    ranges = within(start=(1.0, float("inf")))
 
     def __post_init__(self) -> None:
         """Refuse what no run could use."""
         super().__post_init__()
-        check_numeric("start", self.start, 1)
         check_until(self.every, "every")
         if self.begin != 0:
             check_until(self.begin, "begin")
@@ -65,7 +65,7 @@ class LevelMask(Mask):
     def rank_values(self, count: int, context: Context) -> Tensor:
         """Mask over levels."""
         begin = 0 if self.begin == 0 else context.end(self.begin)
-        start = context.at(self.start, "start", 1)
+        start = self.now("start", context)
         return masks.level_mask(count, context.step, start=start, begin=begin, every=context.end(self.every))
 
     def end(self, count: int, total_steps: int) -> int | None:
@@ -110,11 +110,11 @@ class ViewDependenceMask(Mask):
     bands: Numeric = 2
     until: Numeric | None = None
     coefficients: int | None = None
+    ranges = within(bands=NOT_NEGATIVE)
 
     def __post_init__(self) -> None:
         """Refuse what no run could use."""
         super().__post_init__()
-        check_numeric("bands", self.bands, 0)
         if self.until is not None:
             check_until(self.until)
         if self.coefficients is not None and (
@@ -132,7 +132,7 @@ class ViewDependenceMask(Mask):
         """Mask over bands."""
         if self.until is not None and context.step >= context.end(self.until):
             return torch.ones(count)
-        return (torch.arange(count) < math.floor(context.at(self.bands, "bands", 0))).float()
+        return (torch.arange(count) < math.floor(self.now("bands", context))).float()
 
     def end(self, count: int, total_steps: int) -> int | None:
         """The step that `until` stands for."""

@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 from gridreg.attach.sites import SiteLike
-from gridreg.base import Context, Regularizer, register
+from gridreg.base import NOT_NEGATIVE, Context, Regularizer, register, within
 from gridreg.errors import InputError
 from gridreg.regularizers.filters import Boundary, fourier_low_pass, gaussian_blur
 from gridreg.regularizers.smoothness import NO_NEIGHBOURS
-from gridreg.schedules import Linear, Numeric, check_numeric
+from gridreg.schedules import Linear, Numeric
 
 __all__ = ["FourierLowPass", "GridBlur", "annealed_radius"]
 
@@ -128,17 +128,11 @@ class FourierLowPass(_GridFilter):
     site: SiteLike
     keep: Numeric = _FOURIERF_KEEP
     boundary: Boundary = "periodic"
-
-    def __post_init__(self) -> None:
-        """Refuse at once what can be refused before the first step."""
-        super().__post_init__()
-        check_numeric("keep", self.keep, 0.0, 1.0)
-        if self.boundary not in ("periodic", "mirror"):
-            raise InputError(f"boundary={self.boundary!r}: expected 'periodic' or 'mirror'")
+    ranges = within(keep=(0.0, 1.0))
 
     def number(self, context: Context) -> float:
         """Share of the spectrum."""
-        return context.at(self.keep, "keep", 0.0, 1.0)
+        return self.now("keep", context)
 
     def is_identity(self, context: Context) -> bool:
         """The whole spectrum passes."""
@@ -185,22 +179,13 @@ class GridBlur(_GridFilter):
     rounds: Numeric = 30
     rate: Numeric = 0.2
     floor: Numeric = 0.0
-
-    def __post_init__(self) -> None:
-        """Refuse at once what can be refused before the first step."""
-        super().__post_init__()
-        check_numeric("until", self.until, low=0.0)
-        for name in ("start", "rounds", "rate", "floor"):
-            check_numeric(name, getattr(self, name), low=0.0)
+    ranges = dict.fromkeys(("until", "start", "rounds", "rate", "floor"), NOT_NEGATIVE)
 
     def number(self, context: Context) -> float:
         """Radius, share of the grid's edge."""
-        start, rate, floor = (
-            context.at(getattr(self, name), name, low=0.0) for name in ("start", "rate", "floor")
-        )
-        rounds = int(context.at(self.rounds, "rounds", low=0.0))
-        end = context.end(self.until)
-        return annealed_radius(context.step, end, start=start, rounds=rounds, rate=rate, floor=floor)
+        now = {name: self.now(name, context) for name in ("start", "rate", "floor")}
+        rounds = int(self.now("rounds", context))
+        return annealed_radius(context.step, context.end(self.until), rounds=rounds, **now)
 
     def is_identity(self, context: Context) -> bool:
         """The radius is 0."""

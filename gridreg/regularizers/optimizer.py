@@ -9,9 +9,9 @@ from typing import Any, TypeAlias
 from torch import Tensor
 
 from gridreg.attach.sites import Grid, SiteLike
-from gridreg.base import Context, Regularizer, register
+from gridreg.base import NOT_NEGATIVE, Context, Regularizer, register, within
 from gridreg.errors import InputError
-from gridreg.schedules import Numeric, check_numeric
+from gridreg.schedules import Numeric
 
 __all__ = ["LearningRate", "WeightDecay", "split_groups"]
 
@@ -87,11 +87,7 @@ class WeightDecay(Regularizer):
 
     site: SiteLike
     decay: Numeric = 0.2
-
-    def __post_init__(self) -> None:
-        """Refuse at once what can be refused before the first step."""
-        super().__post_init__()
-        check_numeric("decay", self.decay, low=0.0)
+    ranges = within(decay=NOT_NEGATIVE)
 
     def parameter_groups(self, groups: Groups, grids: Sequence[Grid], context: Context) -> Groups:
         """Set the site's parameters apart, with their decay."""
@@ -108,7 +104,7 @@ class WeightDecay(Regularizer):
 
     def value(self, context: Context) -> float:
         """Decay now."""
-        return context.at(self.decay, "decay", low=0.0)
+        return self.now("decay", context)
 
     @classmethod
     def examples(cls, site: SiteLike) -> list[Regularizer]:
@@ -141,11 +137,7 @@ class LearningRate(Regularizer):
 
     site: SiteLike
     scale: Numeric = 1.0
-
-    def __post_init__(self) -> None:
-        """Refuse at once what can be refused before the first step."""
-        super().__post_init__()
-        check_numeric("scale", self.scale, low=_LOWEST_SCALE)
+    ranges = within(scale=(_LOWEST_SCALE, float("inf")))
 
     def parameter_groups(self, groups: Groups, grids: Sequence[Grid], context: Context) -> Groups:
         """Set the site's parameters apart, with their learning rate."""
@@ -172,7 +164,7 @@ class LearningRate(Regularizer):
 
     def value(self, context: Context) -> float:
         """Factor now."""
-        return context.at(self.scale, "scale", low=_LOWEST_SCALE)
+        return self.now("scale", context)
 
     @classmethod
     def examples(cls, site: SiteLike) -> list[Regularizer]:

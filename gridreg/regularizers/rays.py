@@ -10,10 +10,10 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from gridreg.attach.sites import SiteLike
-from gridreg.base import Context, Regularizer, register
+from gridreg.base import Context, Regularizer, register, within
 from gridreg.errors import InputError
 from gridreg.samples import RaySamples
-from gridreg.schedules import Numeric, check_numeric
+from gridreg.schedules import Numeric
 from gridreg.segments import before_less_behind
 
 __all__ = [
@@ -192,15 +192,11 @@ class RayEntropy(Regularizer):
 
     weight: Numeric = 1e-3
     threshold: Numeric = 0.1
-
-    def __post_init__(self) -> None:
-        """Refuse at once what can be refused before the first step."""
-        super().__post_init__()
-        check_numeric("threshold", self.threshold, 0.0, 1.0)
+    ranges = within(threshold=(0.0, 1.0))
 
     def penalty(self, samples: RaySamples, context: Context) -> Tensor:
         """`ray_entropy` with the threshold of this step."""
-        return ray_entropy(samples, context.at(self.threshold, "threshold", 0.0, 1.0))
+        return ray_entropy(samples, self.now("threshold", context))
 
     @classmethod
     def examples(cls, site: SiteLike) -> list[Regularizer]:

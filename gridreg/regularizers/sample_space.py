@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from gridreg.attach.sites import SiteLike
-from gridreg.base import Context, Regularizer, register
-from gridreg.schedules import Numeric, check_numeric
+from gridreg.base import NOT_NEGATIVE, Context, Regularizer, register, within
+from gridreg.schedules import Numeric
 
 __all__ = ["SampleSpaceAnnealing", "anneal_space"]
 
@@ -64,12 +64,7 @@ class SampleSpaceAnnealing(Regularizer):
     until: Numeric = 256
     start: Numeric = 0.5
     middle: Numeric = 0.5
-
-    def __post_init__(self) -> None:
-        """Refuse at once what can be refused before the first step."""
-        check_numeric("until", self.until, low=0.0)
-        check_numeric("start", self.start, 0.0, 1.0)
-        check_numeric("middle", self.middle, 0.0, 1.0)
+    ranges = within(until=NOT_NEGATIVE, start=(0.0, 1.0), middle=(0.0, 1.0))
 
     def near_far(self, near: Tensor, far: Tensor, context: Context) -> tuple[Tensor, Tensor]:
         """`anneal_space` at this step."""
@@ -77,14 +72,14 @@ class SampleSpaceAnnealing(Regularizer):
             near,
             far,
             context.step / context.end(self.until),
-            start=context.at(self.start, "start", 0.0, 1.0),
-            middle=context.at(self.middle, "middle", 0.0, 1.0),
+            start=self.now("start", context),
+            middle=self.now("middle", context),
         )
 
     def value(self, context: Context) -> float:
         """Share of the interval now."""
         progress = context.step / context.end(self.until)
-        return min(max(progress, context.at(self.start, "start", 0.0, 1.0)), 1.0)
+        return min(max(progress, self.now("start", context)), 1.0)
 
     @classmethod
     def examples(cls, site: SiteLike) -> list[Regularizer]:

@@ -11,9 +11,9 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from gridreg.attach.sites import Grid, SiteLike
-from gridreg.base import Context, LocalTerm, Regularizer, register
+from gridreg.base import NOT_NEGATIVE, Context, LocalTerm, Regularizer, register, within
 from gridreg.errors import InputError
-from gridreg.schedules import Linear, Numeric, check_numeric
+from gridreg.schedules import Linear, Numeric
 
 __all__ = [
     "NO_NEIGHBOURS",
@@ -148,16 +148,14 @@ class TotalVariation(Regularizer):
     form: Form = "squared"
     delta: float = 1.0
     share: float = 1.0
+    ranges = within(delta=NOT_NEGATIVE, share=(0.0, 1.0))
 
     def __post_init__(self) -> None:
         """Refuse at once what can be refused before the first step."""
         super().__post_init__()
         if isinstance(self.every, bool) or not isinstance(self.every, int) or self.every < 1:
             raise InputError(f"TotalVariation: found every={self.every!r}, expected an integer of at least 1")
-        if self.form not in ("squared", "absolute", "huber"):
-            raise InputError(f"form={self.form!r}: expected 'squared', 'absolute' or 'huber'")
-        for name, high in (("delta", float("inf")), ("share", 1.0)):
-            check_numeric(name, getattr(self, name), 0.0, high)
+        for name in self.ranges:
             if getattr(self, name) == 0:
                 raise InputError(f"{name}=0: expected a number above 0")
 
