@@ -220,9 +220,7 @@ def test_bad_input_ends_with_one_line_and_status_2(tmp_path):
         [*program, str(tmp_path / "none.yaml")], capture_output=True, text=True, timeout=100
     )
     assert ended.returncode == 2
-    assert ended.stderr.splitlines() == [
-        f"error: {tmp_path / 'none.yaml'}: no such file; expected a study in YAML"
-    ]
+    assert ended.stderr.splitlines() == [f"error: {tmp_path / 'none.yaml'}: study not found"]
 
 
 def test_studies_that_come_along_are_found_by_name(tmp_path, capsys):

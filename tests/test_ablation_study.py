@@ -345,9 +345,9 @@ def test_studies_that_mean_nothing(text, message):
 
 
 def test_files_that_cannot_be_read(tmp_path):
-    with pytest.raises(InputError, match=r"none\.yaml: no such file"):
+    with pytest.raises(InputError, match=r"none\.yaml: study not found"):
         load_study(tmp_path / "none.yaml")
-    with pytest.raises(InputError, match="cannot read"):
+    with pytest.raises(InputError, match="cannot be read"):
         load_study(tmp_path)
     (tmp_path / "bytes.yaml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(InputError, match="not UTF-8"):

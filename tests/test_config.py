@@ -255,8 +255,8 @@ def test_a_missing_key(tmp_path):
 
 
 def test_files_that_cannot_be_read(tmp_path):
-    assert "no such file" in message(read_yaml, tmp_path / "none.yaml")
-    assert "cannot read" in message(read_yaml, tmp_path)
+    assert "YAML file not found" in message(read_yaml, tmp_path / "none.yaml")
+    assert "cannot be read" in message(read_yaml, tmp_path)
     (tmp_path / "latin.yaml").write_bytes(b"name: caf\xe9")
     assert "not UTF-8 text at byte 9" in message(read_yaml, tmp_path / "latin.yaml")
 

@@ -282,7 +282,7 @@ EXAMPLE = Path(__file__).parents[1] / "examples" / "few_tensorf_blender.py"
         (["--scene", "nowhere"], "nowhere: no such scene folder"),
         (["--steps", "0"], "--steps: found 0"),
         (["--set", "train.stebs=3"], "stebs"),
-        (["--config", "missing.yaml"], "missing.yaml: no such file"),
+        (["--config", "missing.yaml"], "missing.yaml: YAML file not found"),
         (["--resume"], "--resume: expected the run's folder"),
         (["--backbone", "nerf"], "backbone: found 'nerf'"),
     ],

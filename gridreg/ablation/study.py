@@ -33,8 +33,9 @@ import gridreg
 from gridreg.ablation.records import RunSpec, Study
 from gridreg.ablation.rows import Row, expand_rows
 from gridreg.ablation.study_file import StudyFile
-from gridreg.errors import ConfigError, InputError
+from gridreg.errors import ConfigError
 from gridreg.fields import field_names, make_field
+from gridreg.scenes.files import read_text
 from gridreg.scenes.protocols import Every, Listed, Protocol, get_protocol
 from gridreg.training.config import from_data, override, to_data
 from gridreg.training.options import TrainOptions, configure
@@ -59,14 +60,7 @@ def load_study(path: str | os.PathLike[str]) -> Study:
             unknown compositions, scenes, protocols, presets or fields, a study without runs.
     """
     file = Path(path)
-    try:
-        text = file.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise InputError(f"{file}: no such file; expected a study in YAML") from None
-    except UnicodeDecodeError as error:
-        raise InputError(f"{file}: not UTF-8 text at byte {error.start}") from error
-    except OSError as error:
-        raise InputError(f"{file}: cannot read: {error.strerror}") from error
+    text = read_text(file, "study")
     return study_from_text(text, source=str(file), name=file.stem, folder=file.parent)
 
 

@@ -124,12 +124,17 @@ def points_extent(poses: NDArray[np.float64], points: NDArray[np.float64]) -> Ex
     smallest, largest, count = np.empty(0), 0.0, 0
     for pose in poses:
         offset = inside - pose[:3, 3]
-        distance = np.linalg.norm(offset, axis=-1)[(offset * -pose[:3, 2]).sum(axis=-1) > 0]
+        distance = np.linalg.norm(offset, axis=-1)[offset @ -pose[:3, 2] > 0]
         count, largest = count + len(distance), max(largest, float(distance.max(initial=0.0)))
-        smallest = np.sort(np.concatenate([smallest, distance]))[:few]
+        if len(smallest) == few:
+            distance = distance[distance < smallest.max()]
+        smallest = np.concatenate([smallest, distance])
+        if len(smallest) > few:
+            smallest = np.partition(smallest, few - 1)[:few]
     if not count:
         raise InputError(f"cameras: none has a point of the model before it; {ADVICE}")
     # The quantile 0.001 of them all, as np.quantile interpolates it.
+    smallest.sort()
     below, fraction = divmod(0.001 * (count - 1), 1)
     low, high = smallest[int(below)], smallest[min(int(below) + 1, count - 1)]
     return Extent(0.9 * float(low + (high - low) * fraction), 1.1 * largest, bounds)

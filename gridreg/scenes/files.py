@@ -62,7 +62,7 @@ def read_text(path: str | os.PathLike[str], kind: str = "file") -> str:
     try:
         return read_bytes(path, kind).decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(f"{os.fspath(path)}: not UTF-8 text (byte {error.start})") from None
+        raise InputError(f"{os.fspath(path)}: not UTF-8 text at byte {error.start}") from None
 
 
 def read_json(path: str | os.PathLike[str]) -> dict[str, Any]:

@@ -204,6 +204,10 @@ def _settle(folder: Path, new: Path, old: Path) -> None:
 
 def _read(folder: Path) -> tuple[dict[str, Any], bytes]:
     """The content of ``state.json`` and the bytes of the tensors, both verified."""
+    for path in (folder / _STATE, folder / _TENSORS):
+        # A pipe would wait for ever, and a device never ends.
+        if path.exists() and not path.is_file():
+            raise InputError(f"{path}: found no regular file, expected one")
     try:
         content = json.loads((folder / _STATE).read_bytes())
         data = (folder / _TENSORS).read_bytes()

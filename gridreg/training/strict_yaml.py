@@ -13,12 +13,12 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, NoReturn
 
 import yaml
 
-from gridreg.errors import ConfigError, InputError, KeyPath
+from gridreg.errors import ConfigError, KeyPath
+from gridreg.scenes.files import read_text
 
 __all__ = ["Document", "dump_yaml", "parse_yaml", "read_yaml"]
 
@@ -82,15 +82,7 @@ def read_yaml(path: str | os.PathLike[str]) -> Document:
         InputError: if the file cannot be read, is not YAML, or uses what is refused here (anchors and
             aliases, tags, duplicate keys, keys that are not text); the text names file and line.
     """
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise InputError(f"{os.fspath(path)}: no such file; expected a YAML file") from None
-    except UnicodeDecodeError as error:
-        raise InputError(f"{os.fspath(path)}: not UTF-8 text at byte {error.start}") from error
-    except OSError as error:
-        raise InputError(f"{os.fspath(path)}: cannot read: {error.strerror}") from error
-    return parse_yaml(text, os.fspath(path))
+    return parse_yaml(read_text(path, "YAML file"), os.fspath(path))
 
 
 def parse_yaml(text: str, source: str = "YAML") -> Document:
