@@ -27,7 +27,7 @@ from gridreg.training.options import TrainOptions
 
 STUDY = "quality"
 PROTOCOL = "dietnerf8"
-"""Where none is named."""
+"""The protocol where none is named."""
 HEAD = (
     "scene",
     "protocol",

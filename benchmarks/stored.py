@@ -16,7 +16,7 @@ from gridreg.training.files import check_output_folder, write_text
 
 RESULTS = Path(__file__).parent / "results"
 SCENES = Path(__file__).parents[1] / "outputs" / "benchmarks"
-"""Where the built-in scene is drawn: not in a folder for temporary files that anybody could have made first."""
+"""Folder of the built-in scene: not in a folder for temporary files that anybody could have made first."""
 Record = dict[str, Any]
 
 

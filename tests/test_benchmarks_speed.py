@@ -127,14 +127,14 @@ def test_time_that_the_host_gives_to_others(tmp_path: Path) -> None:
     stat = tmp_path / "stat"
     stat.write_text("cpu  100 0 50 800 10 0 0 40 7 0\ncpu0 1 2 3\n")
     stolen = whole_run.Stolen(stat)
-    assert stolen.share() is None
+    assert stolen.fraction() is None
     stat.write_text("cpu  160 0 60 810 10 0 0 60 9 0\ncpu0 1 2 3\n")
-    assert stolen.share() == pytest.approx(0.2)
+    assert stolen.fraction() == pytest.approx(0.2)
     for other in ("cpu  1 2 3\n", "intr 1 2 3 4 5 6 7 8\n", "nothing"):
         stat.write_text(other)
-        assert stolen.share() is None
-        assert whole_run.Stolen(stat).share() is None
-    assert whole_run.Stolen(tmp_path / "missing").share() is None
+        assert stolen.fraction() is None
+        assert whole_run.Stolen(stat).fraction() is None
+    assert whole_run.Stolen(tmp_path / "missing").fraction() is None
 
 
 def test_memory(

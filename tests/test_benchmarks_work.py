@@ -132,7 +132,7 @@ def test_backward_lookups_by_counting() -> None:
     upstream = Number() * ((Number() / -25.0).f() * -25.0)
     of_slope, Number.done = Number.done, 0
     add_gradients(COUNTS.density_channels, [upstream] * 6)
-    expected = COUNTS.samples * of_slope + COUNTS.felt * Number.done
+    expected = COUNTS.samples * of_slope + COUNTS.nonzero * Number.done
     assert work(COUNTS)["backward/density"].operations == expected
 
 

@@ -1,1 +1,1 @@
-"""What training and rendering cost: see docs/speed.md."""
+"""Costs of training and rendering: see docs/speed.md."""

@@ -1,4 +1,4 @@
-"""What all commands share: scenes, turns, figures, tables and stored files."""
+"""Common parts of all commands: scenes, turns, figures, tables and stored files."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def spread(values: Sequence[float]) -> dict[str, float]:
 
 
 def ratios(times: dict[str, list[float]], base: str) -> dict[str, dict[str, float]]:
-    """Of every other contestant to ``base``, turn by turn."""
+    """Return the ratios of every other contestant to ``base``, turn by turn."""
     return {
         name: spread([a / b for a, b in zip(values, times[base], strict=True)])
         for name, values in times.items()
@@ -126,7 +126,7 @@ def plain_arguments(arguments: argparse.Namespace) -> Record:
 
 
 def record_of(arguments: argparse.Namespace, figures: Record) -> Record:
-    """What is stored: figures, arguments, versions and machine."""
+    """Return what is stored: figures, arguments, versions and machine."""
     return {
         "benchmark": f"speed {arguments.command}",
         "command": arguments.command,
@@ -173,8 +173,8 @@ def ms(seconds: float) -> str:
     return f"{value:.0f}" if value >= 100 else f"{value:.1f}" if value >= 10 else f"{value:.2f}"
 
 
-def percent(share: float) -> str:
-    return f"{100 * share:.0f} %"
+def percent(fraction: float) -> str:
+    return f"{100 * fraction:.0f} %"
 
 
 def title(record: Record) -> str:
@@ -187,7 +187,7 @@ def title(record: Record) -> str:
 
 
 def situation_line(record: Record, one: Record) -> str:
-    """What was measured in a situation."""
+    """Return a line on what was measured in a situation."""
     return (
         f"**{one['situation']}**: {record['scene']}, {record['preset']}, {one['rays']} rays with "
         f"{one['density_samples_per_ray']:.1f} density and {one['colour_samples_per_ray']:.1f} colour samples each."

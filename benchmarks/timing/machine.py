@@ -1,4 +1,4 @@
-"""What this processor can do, measured: memory bandwidth and arithmetic rate."""
+"""Rates of this processor, measured: memory bandwidth and arithmetic rate."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The commands and what they share."""
+"""The commands, and the options that all of them have."""
 
 from __future__ import annotations
 

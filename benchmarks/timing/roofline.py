@@ -77,12 +77,12 @@ def _updated(trainer: Any) -> int:
     return total
 
 
-def felt_by(situation: Situation, turn: int) -> Tensor:
-    """Which samples of a turn have a gradient of their density, once the small ones are rounded: ``(N,)`` bool."""
+def nonzero_gradients(situation: Situation, turn: int) -> Tensor:
+    """Return which samples ``(N,)`` of a turn have a gradient of their density, once small ones are rounded."""
     found: list[Tensor] = []
 
-    def watched(values: Tensor, share: float) -> Tensor:
-        rounded = round_stochastically(values, share)
+    def watched(values: Tensor, fraction: float) -> Tensor:
+        rounded = round_stochastically(values, fraction)
         found.append(rounded != 0)
         return rounded
 
@@ -93,7 +93,7 @@ def felt_by(situation: Situation, turn: int) -> Tensor:
 
 @torch.no_grad()
 def counts_of(situation: Situation, turn: int = 0) -> Counts:
-    """What the step of a turn finds.
+    """Return what the step of a turn finds.
 
     Raises:
         InputError: if the field is not a VM field with an MLP for its decoder.
@@ -104,7 +104,7 @@ def counts_of(situation: Situation, turn: int = 0) -> Counts:
     if not hasattr(field.decoder, "layers"):
         raise InputError("roofline: found a decoder without layers, expected one of mlp, mlp_fea, mlp_pe")
     with torch.enable_grad():
-        felt = felt_by(situation, turn)
+        nonzero = nonzero_gradients(situation, turn)
     situation.rewind(turn)
     trainer.handle.step(situation.step)
     rendered = trainer.render_batch()[0]
@@ -127,8 +127,8 @@ def counts_of(situation: Situation, turn: int = 0) -> Counts:
         appearance_channels=_open(field, "appearance"),
         density_nodes=touched_nodes(u, field.resolution),
         appearance_nodes=touched_nodes(u[coloured], field.resolution),
-        felt=int(felt.sum()),
-        felt_nodes=touched_nodes(u[felt], field.resolution),
+        nonzero=int(nonzero.sum()),
+        nonzero_nodes=touched_nodes(u[nonzero], field.resolution),
         features=decoder.features,
         layers=(sum(decoder.block_sizes), *(layer.weight.shape[0] for layer in decoder.layers)),
         encodings=tuple(encodings),

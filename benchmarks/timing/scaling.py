@@ -116,7 +116,7 @@ def measure(arguments: argparse.Namespace) -> tuple[Record, str]:
 
 
 def speedups(threaded: dict[str, dict[str, Record]]) -> dict[str, dict[str, float]]:
-    """How many times as fast as one thread, where one was measured."""
+    """Return how many times as fast as one thread each number is, where one was measured."""
     found = {}
     for name, rows in threaded.items():
         if "1" in rows:

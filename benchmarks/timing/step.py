@@ -89,14 +89,14 @@ class Watched:
     def figures(self, skip: int = 0) -> Record:
         """Medians of the stages without the first turns.
 
-        ``sum_of_stages`` is the share that all stages make of the whole step as a clock outside measured it.
+        ``sum_of_stages`` is the fraction that all stages make of the whole step as a clock outside measured it.
         """
         turns = self.turns[skip:]
         stages = [watch.by_stage() for _, watch in turns]
-        shares = [sum(found.values()) / whole for found, (whole, _) in zip(stages, turns, strict=True)]
+        fractions = [sum(found.values()) / whole for found, (whole, _) in zip(stages, turns, strict=True)]
         return {
             "stages": {name: statistics.median([found[name] for found in stages]) for name in STAGES},
-            "sum_of_stages": statistics.median(shares),
+            "sum_of_stages": statistics.median(fractions),
         }
 
     def typical(self, skip: int = 0) -> tuple[float, dict[str, float]]:

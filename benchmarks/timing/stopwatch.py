@@ -105,7 +105,7 @@ def replaced(owner: Any, name: str, value: Any) -> Iterator[None]:
 
 
 def places_of(trainer: Trainer) -> list[Place]:
-    """Where the stages of a trainer's iteration begin and end, on the compiled and on the plain path."""
+    """Return where the stages of a trainer's iteration begin and end, on the compiled and on the plain path."""
     field, handle = trainer.field, trainer.handle
     found = [
         Place(trainer.bank, "draw", "rays"),

@@ -44,9 +44,9 @@ def peak_bytes(status: Path = Path("/proc/self/status")) -> int:
 
 
 class Stolen:
-    """The share of all processors' time that the host of a virtual machine gives to others, from now on.
+    """The fraction of all processors' time that the host of a virtual machine gives to others, from now on.
 
-    Seconds of a program that ran meanwhile are too long by that share or more, as threads wait for each other.
+    Seconds of a program that ran meanwhile are too long by that fraction or more, as threads wait for each other.
     """
 
     def __init__(self, stat: Path = Path("/proc/stat")) -> None:
@@ -63,7 +63,7 @@ class Stolen:
             return None
         return (sum(ticks), ticks[7]) if words[:1] == ["cpu"] and len(ticks) == 8 else None
 
-    def share(self) -> float | None:
+    def fraction(self) -> float | None:
         """In [0, 1]; None where it is not known."""
         ended = self._ticks()
         if self.began is None or ended is None or ended[0] <= self.began[0]:
@@ -83,7 +83,7 @@ class Spans:
     def __init__(self, settings: TrainSettings) -> None:
         self.ends = boundaries(settings)[1:]
         self.rows: list[Record] = []
-        self.stolen_share: float | None = None
+        self.stolen_fraction: float | None = None
 
     def start(self, run: Execution) -> None:
         self.run, self.began, self.first = run, time.perf_counter(), run.trainer.step
@@ -105,7 +105,7 @@ class Spans:
             }
         )
         self.first, self.began = step, now
-        self.stolen_share = self.stolen.share()
+        self.stolen_fraction = self.stolen.fraction()
         # The events of this iteration have been, so this is the grid of the next span.
         self.resolution = list(getattr(self.run.trainer.field, "resolution", ()))
 
@@ -116,7 +116,7 @@ def add_arguments(parser: argparse.ArgumentParser, preset: str) -> None:
 
 
 def add_shortened_arguments(parser: argparse.ArgumentParser, steps: int) -> None:
-    """Of commands that need no more of a run than all of its events."""
+    """Add the options of commands that need no more of a run than all of its events."""
     add_arguments(parser, preset="quick")
     parser.add_argument(
         "--steps",
@@ -151,7 +151,7 @@ def run_here(arguments: argparse.Namespace) -> Record:
         "seed": metrics["seed"],
         "mean": metrics["mean"],
         "seconds": metrics["seconds"],
-        "stolen": spans.stolen_share,
+        "stolen": spans.stolen_fraction,
         "test_views": len(metrics["images"]),
         "spans": spans.rows,
         "peak_bytes": peaks,

@@ -28,9 +28,9 @@ multiply in bfloat16, else 4.
 
 * march: ``t = t_min + (index + jitter) step`` and ``o + t d``; origin, direction, entry, exit and jitter are read; an
   index, a distance and a position are written.
-* density: a place in the box (6), on the grid (6), the shares' complements (3), the corners of three planes (12); per
-  channel 7 for the plane, 3 for the line, 1 for their product, 1 for the sum; shift, exponential, 1 +, logarithm,
-  scale.
+* density: a position in the box (6), on the grid (6), complements of interpolation weights (3), the corners of three
+  planes (12); per channel 7 for the plane, 3 for the line, 1 for their product, 1 for the sum; shift, exponential,
+  1 +, logarithm, scale.
 * network: the basis ``3 A -> F``, the layers on F features, position and direction with their encodings (the first
   sine and cosine, then 4 operations an octave), sigmoids; a direction is encoded once a ray. Backwards every product
   counts twice, for its weights and for its input, but for columns of the first layer whose input needs no gradient;
@@ -67,13 +67,13 @@ PARTS = (
 
 @dataclass(frozen=True)
 class Counts:
-    """What was counted in a step.
+    """Counts of a step.
 
     Args:
         rays, steps, cells, samples, coloured: R, S, number of occupancy cells, N and M.
         density_channels, appearance_channels: D and A that are open.
         density_nodes, appearance_nodes: P of either.
-        felt, felt_nodes: F and Q.
+        nonzero, nonzero_nodes: F and Q.
         features: F that the decoder reads.
         layers: widths of the decoder, its input first.
         encodings: inputs of the decoder as (dimensions, octaves): features, direction, position if it reads it.
@@ -90,8 +90,8 @@ class Counts:
     appearance_channels: int
     density_nodes: int
     appearance_nodes: int
-    felt: int
-    felt_nodes: int
+    nonzero: int
+    nonzero_nodes: int
     features: int
     layers: tuple[int, ...]
     encodings: tuple[tuple[int, int], ...]
@@ -100,13 +100,13 @@ class Counts:
 
     @property
     def component_bytes(self) -> int:
-        """Of a product of plane and line that is handed to the basis."""
+        """Bytes of a product of plane and line that is handed to the basis."""
         return 2 if self.low else 4
 
 
 @dataclass(frozen=True)
 class Work:
-    """What a stage must do.
+    """Work that a stage must do.
 
     Args:
         bytes: to and from memory.
@@ -130,12 +130,12 @@ class Work:
 
 
 def layer_operations(widths: tuple[int, ...]) -> int:
-    """Of one row through linear layers."""
+    """Return the operations of one row through linear layers."""
     return sum(2 * a * b for a, b in itertools.pairwise(widths))
 
 
 def encoding_operations(dimensions: int, octaves: int) -> int:
-    """Of one row's sines and cosines: the first two are computed, each further octave doubles the angle in 4."""
+    """Return those of one row's sines and cosines: two are computed, each further octave doubles the angle in 4."""
     return dimensions * (2 + 4 * (octaves - 1)) if octaves else 0
 
 
@@ -157,11 +157,11 @@ def lookup_work(m: int, channels: int, nodes: int, size: int) -> Work:
     return Work(kept + 4 * channels * nodes, m * (33 * channels + 27), cached=kept + 72 * channels * m)
 
 
-def density_backward_work(n: int, felt: int, channels: int, nodes: int) -> Work:
-    """Gradients of planes and lines from that of the density, of which ``felt`` are not 0."""
+def density_backward_work(n: int, nonzero: int, channels: int, nodes: int) -> Work:
+    """Gradients of planes and lines from that of the density, of which ``nonzero`` are not 0."""
     kept = 20 * n
-    operations = 4 * n + felt * (72 * channels + 27)
-    return Work(kept + 12 * channels * nodes, operations, cached=kept + 216 * channels * felt)
+    operations = 4 * n + nonzero * (72 * channels + 27)
+    return Work(kept + 12 * channels * nodes, operations, cached=kept + 216 * channels * nonzero)
 
 
 def lookup_backward_work(m: int, channels: int, nodes: int, size: int) -> Work:
@@ -212,6 +212,6 @@ def work(c: Counts) -> dict[str, Work]:
         "backward/lookup": lookup_backward_work(
             m, c.appearance_channels, c.appearance_nodes, c.component_bytes
         ),
-        "backward/density": density_backward_work(n, c.felt, c.density_channels, c.felt_nodes),
+        "backward/density": density_backward_work(n, c.nonzero, c.density_channels, c.nonzero_nodes),
         "optimiser": streamed(32 * c.parameters, 13 * c.parameters),
     }

@@ -37,7 +37,7 @@ def one_channel(channel: int = 9) -> str:
     """One channel in both forms."""
     panel = Panel(
         f"Channel {channel} of {CHANNELS} over the run",
-        x=(0, 1), y=(0, 1.25), x_label="share of the run", y_label="mask", x_ticks=(0, 0.2, 0.4, 0.6, 0.8, 1),
+        x=(0, 1), y=(0, 1.25), x_label="fraction of the run", y_label="mask", x_ticks=(0, 0.2, 0.4, 0.6, 0.8, 1),
         y_ticks=(0, 0.5, 1),
     )  # fmt: skip
     steps = np.arange(TOTAL + 1)
@@ -62,10 +62,10 @@ class Product(nn.Module):
 
 
 def squared(channel: int = 9) -> str:
-    """What a product is multiplied by if one factor is masked, or both."""
+    """Draw the factor of a product if one factor is masked, or both."""
     panel = Panel(
         f"Factor of a plane-line product, channel {channel}",
-        x=(0.25, 0.6), y=(0, 1.15), x_label="share of the run", x_ticks=(0.3, 0.4, 0.5, 0.6), y_ticks=(0, 0.5, 1),
+        x=(0.25, 0.6), y=(0, 1.15), x_label="fraction of the run", x_ticks=(0.3, 0.4, 0.5, 0.6), y_ticks=(0, 0.5, 1),
     )  # fmt: skip
     steps = np.arange(int(0.25 * TOTAL), int(0.6 * TOTAL) + 1)
     for series, (glob, text) in enumerate((("line", "line masked"), ("*", "both masked")), start=1):
@@ -80,14 +80,14 @@ def squared(channel: int = 9) -> str:
     return panel.svg()
 
 
-def order(name: gridreg.encodings.Order, title: str, share: float = 0.25, coordinates: str = "xyz") -> str:
-    """Which waves a mask by channel index leaves open: columns are octaves."""
+def order(name: gridreg.encodings.Order, title: str, progress: float = 0.25, coordinates: str = "xyz") -> str:
+    """Draw which waves a mask by channel index leaves open: columns are octaves."""
     count = 3
     octaves = gridreg.octaves_of_channels(len(coordinates), count, name)
     # The encoding of a point itself says which wave stands in which channel.
     point = torch.tensor([0.3, 0.7, 1.1], dtype=torch.float64)
     encoded = gridreg.positional_encoding(point, count, name).tolist()
-    mask = gridreg.frequency_mask(len(octaves), share, 1.0).tolist()
+    mask = gridreg.frequency_mask(len(octaves), progress, 1.0).tolist()
     parts = [f'<text x="12" y="15" class="title">{title}</text>']
     columns = ["itself", *(f"2^{k}" for k in range(count))]
     parts += [
@@ -113,7 +113,7 @@ def order(name: gridreg.encodings.Order, title: str, share: float = 0.25, coordi
 
 
 def reach() -> str:
-    """How far 20 steps of half a voxel reach in a box of edge 3."""
+    """Draw how far 20 steps of half a voxel reach in a box of edge 3."""
     nodes = np.arange(64, 513, 4)
     panel = Panel(
         "Reach of the first 20 steps, box of edge 3",

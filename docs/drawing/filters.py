@@ -31,7 +31,7 @@ class Line(nn.Module):
 
 
 def filtered(regularizer: gridreg.Regularizer, step: int, total_steps: int = 100) -> np.ndarray:
-    """What a field sees of the example line at a step."""
+    """Return what a field sees of the example line at a step."""
     field = Line()
     with gridreg.apply(field, regularizer, total_steps=total_steps) as handle, torch.no_grad():
         handle.step(step)
@@ -39,7 +39,7 @@ def filtered(regularizer: gridreg.Regularizer, step: int, total_steps: int = 100
 
 
 def response() -> str:
-    """Factors of the frequencies for some shares."""
+    """Factors of the frequencies for some fractions."""
     highest = 32
     numbers = torch.linspace(0, highest, 257)
     panel = Panel(
@@ -85,7 +85,7 @@ def diagrams() -> dict[str, str]:
     steps = np.linspace(0, 1, 601)
     panel = Panel(
         "Radius of GridBlur(until=0.3)",
-        x=(0, 0.4), y=(0, 0.16), x_label="share of the run", y_label="share of the edge",
+        x=(0, 0.4), y=(0, 0.16), x_label="fraction of the run", y_label="fraction of the edge",
         x_ticks=(0, 0.1, 0.2, 0.3, 0.4), y_ticks=(0, 0.05, 0.1, 0.15),
     )  # fmt: skip
     panel.line(0.4 * steps, [annealed_radius(0.4 * step, 0.3) for step in steps])

@@ -28,7 +28,7 @@ class Ones(nn.Module):
 def seen(
     *regularizers: gridreg.Regularizer, channels: int, steps: NDArray[np.int64] = STEPS
 ) -> NDArray[np.float64]:
-    """What the field sees of ones at ``(channels, steps)``, through regularizers attached to ``grid``."""
+    """Return what the field sees of ones at ``(channels, steps)``, through regularizers attached to ``grid``."""
     field = Ones(channels)
     columns = []
     with gridreg.apply(field, *regularizers, total_steps=TOTAL) as handle, torch.no_grad():

@@ -50,7 +50,7 @@ def occlusion() -> str:
 
 
 def cauchy() -> str:
-    """One sample's share."""
+    """Draw the part of one sample."""
     density = np.linspace(0, 6, 121)
     panel = Panel(
         "CauchySparsity of one sample",
@@ -66,18 +66,19 @@ def cauchy() -> str:
 
 def opacity() -> str:
     """Entropy of a ray's opacity."""
-    share = np.linspace(0.001, 0.999, 121)
+    fraction = np.linspace(0.001, 0.999, 121)
     panel = Panel(
         "OpacityEntropy of one ray",
         x=(0, 1), y=(0, 0.75), x_label="opacity", y_label="nats", x_ticks=(0, 0.5, 1), y_ticks=(0, 0.35, 0.7),
     )  # fmt: skip
-    panel.line(share, values(lambda o: gridreg.opacity_entropy(samples([[-math.log1p(-o)]])), share))
+    entropy = values(lambda o: gridreg.opacity_entropy(samples([[-math.log1p(-o)]])), fraction)
+    panel.line(fraction, entropy)
     return panel.svg()
 
 
 def spread_out() -> str:
     """Entropy of where the matter of a ray is."""
-    share = np.linspace(0.002, 0.998, 121)
+    fraction = np.linspace(0.002, 0.998, 121)
 
     def two(first: float) -> Tensor:
         alphas = (0.9 * first, 0.9 * (1 - first))
@@ -85,10 +86,10 @@ def spread_out() -> str:
 
     panel = Panel(
         "RayEntropy of two lumps on a ray",
-        x=(0, 1), y=(0, 0.75), x_label="share of the first lump", y_label="nats",
+        x=(0, 1), y=(0, 0.75), x_label="fraction of the first lump", y_label="nats",
         x_ticks=(0, 0.5, 1), y_ticks=(0, 0.35, 0.7),
     )  # fmt: skip
-    panel.line(share, values(two, share))
+    panel.line(fraction, values(two, fraction))
     return panel.svg()
 
 

@@ -68,7 +68,7 @@ def annealed_interval() -> str:
 
 
 def gradient_factor() -> str:
-    """What a gradient is multiplied by."""
+    """Draw the factor of a gradient."""
     t = torch.linspace(0, 2, 101, dtype=torch.float64)
     density = torch.ones(1, 101, dtype=torch.float64, requires_grad=True)
     rays = RaySamples.from_dense(t, torch.full_like(t, 0.02), density)
@@ -90,19 +90,19 @@ def decay() -> str:
         x=(0, 1000), y=(0, 1.1), x_label="step, at a learning rate of 0.02", x_ticks=(0, 250, 500, 750, 1000),
         y_ticks=(0, 0.5, 1),
     )  # fmt: skip
-    for series, share in enumerate((0.02, 0.2), start=1):
-        values = decayed(share, 1000)
+    for series, rate in enumerate((0.02, 0.2), start=1):
+        values = decayed(rate, 1000)
         panel.line(np.arange(len(values)), values, series)
-        panel.note(420, values[420] + 0.07, f"decay={share}", series)
+        panel.note(420, values[420] + 0.07, f"decay={rate}", series)
     return panel.svg()
 
 
-def decayed(share: float, steps: int) -> list[float]:
+def decayed(rate: float, steps: int) -> list[float]:
     """Values of a parameter that starts at 1, step by step."""
     layer = nn.Linear(1, 1, bias=False)
     nn.init.ones_(layer.weight)
     with gridreg.apply(
-        layer, gridreg.WeightDecay(gridreg.parameters("weight", dim=0), share), total_steps=steps
+        layer, gridreg.WeightDecay(gridreg.parameters("weight", dim=0), rate), total_steps=steps
     ) as handle:
         groups = handle.parameter_groups([{"params": [layer.weight], "lr": 0.02}])
     optimizer = torch.optim.AdamW(groups)

@@ -46,8 +46,8 @@ def simplified(points: NDArray[np.float64], tolerance: float = 0.06) -> NDArray[
             continue
         (start, chord), inner = (points[first], points[last] - points[first]), points[first + 1 : last]
         # Distance to the segment, not to its line: curves may turn back.
-        share = ((inner - start) @ chord / max(float(chord @ chord), 1e-12)).clip(0, 1)
-        away = np.linalg.norm(inner - start - share[:, None] * chord, axis=1)
+        along = ((inner - start) @ chord / max(float(chord @ chord), 1e-12)).clip(0, 1)
+        away = np.linalg.norm(inner - start - along[:, None] * chord, axis=1)
         if away.max() > tolerance:
             middle = first + 1 + int(away.argmax())
             keep[middle] = True
@@ -105,7 +105,7 @@ class Panel:
         self._parts.append(f'<path class="{name}" d="{_path(self.at(x, y))}"/>')
 
     def area(self, x: ArrayLike, low: ArrayLike, high: ArrayLike, series: int = 1, soft: bool = True) -> None:
-        """What lies between two curves."""
+        """Fill what lies between two curves."""
         upper, lower = (simplified(self.at(x, y)) for y in (high, low))
         outline = _path(np.concatenate([upper, lower[::-1]]), close=True, simplify=False)
         self._parts.append(f'<path class="{"soft" if soft else "area"} f{series}" d="{outline}"/>')
@@ -167,7 +167,7 @@ def ridges(
     values: NDArray[np.float64],
     steps: NDArray[np.float64],
     *,
-    x_label: str = "share of the run",
+    x_label: str = "fraction of the run",
     y_label: str = "channel",
     series: Sequence[int] | None = None,
     labels: Sequence[str] | None = None,

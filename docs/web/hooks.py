@@ -1,4 +1,4 @@
-"""What the site does to its pages: diagrams go inline, and nothing may come from another server."""
+"""Hooks of the site: diagrams go inline, and nothing may come from another server."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def inlined(text: str, docs: Path) -> str:
 
 
 def foreign(text: str) -> list[str]:
-    """What an HTML or CSS file would fetch from another server."""
+    """Return what an HTML or CSS file would fetch from another server."""
     return [html.unescape(found[0]) for found in _FOREIGN.finditer(text)]
 
 

@@ -1,4 +1,4 @@
-"""Where to put cameras: looking at a point, on the orbit on which the cameras of a scene stand."""
+"""Cameras: looking at a point, on the orbit on which the cameras of a scene stand."""
 
 from __future__ import annotations
 
