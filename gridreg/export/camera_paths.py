@@ -13,6 +13,7 @@ from torch import Tensor
 from gridreg.errors import InputError
 from gridreg.export.camera_files import load_cameras
 from gridreg.export.cameras import Orbit, Vector, look_at, orbit_of_box, orbit_of_views, up_axis
+from gridreg.memory import check_memory
 from gridreg.rendering.cameras import Camera, Lens
 from gridreg.scenes import IN_PLACE, Views, World
 from gridreg.scenes.extent import focus_point
@@ -61,6 +62,7 @@ def camera_path(
     Raises:
         InputError: for an unknown name, numbers out of range, "train" without views, or a bad file.
     """
+    check_memory(1000 * frames, f"frames={frames}")
     lens = (
         Lens.from_angle(40.0, 400, 400)
         if views is None

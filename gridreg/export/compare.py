@@ -12,6 +12,7 @@ from scipy.spatial import KDTree  # type: ignore[import-untyped]
 
 from gridreg.errors import InputError
 from gridreg.export.mesh import Mesh
+from gridreg.memory import check_memory
 
 __all__ = ["MeshComparison", "compare_meshes", "sample_surface"]
 
@@ -89,6 +90,7 @@ def sample_surface(mesh: Mesh, count: int, generator: torch.Generator) -> tuple[
     """
     if count < 1:
         raise InputError(f"samples={count}: expected at least 1 point")
+    check_memory(200 * count, f"samples={count}")
     area = float(mesh.to_trimesh().area) if len(mesh.faces) else 0.0
     if not 0 < area < np.inf:
         raise InputError(f"mesh: found {len(mesh.faces)} faces without area, expected a surface")

@@ -19,6 +19,7 @@ from torch import Tensor
 from gridreg.errors import InputError
 from gridreg.export.marching import Faces, Vertices, drop_small_components, polygonise, vertex_normals
 from gridreg.export.volume import SeenDensity, sample_density, surface_threshold
+from gridreg.memory import check_memory
 from gridreg.rendering import Field, OccupancyGrid
 from gridreg.scenes import IN_PLACE, World
 from gridreg.segments import optical_depth_to_weights
@@ -120,8 +121,11 @@ def extract_mesh(
         raise InputError(f"min_component={min_component}: expected a fraction in [0, 1]")
     if refine < 0:
         raise InputError(f"refine={refine}: expected a number of bisection steps, at least 0")
-    density = SeenDensity(field, occupancy, chunk)
     box = field.bounds if bounds is None else bounds.to(field.bounds)
+    edges = (box[1] - box[0]).double()
+    nodes = resolution**3 * float((edges / edges.max()).prod())
+    check_memory(20 * nodes, f"resolution={resolution}: a lattice of {nodes:.3g} nodes")
+    density = SeenDensity(field, occupancy, chunk)
     volume = sample_density(density, box, resolution)
     level = surface_threshold(volume) if threshold is None else threshold
 

@@ -11,6 +11,7 @@ import numpy as np
 from gridreg.errors import InputError
 from gridreg.export.images import DepthRange, check_mode, colour_bar, depth_range, to_image
 from gridreg.export.writers import check_target, write_video
+from gridreg.memory import check_memory
 from gridreg.rendering import Rendered
 from gridreg.rendering.cameras import Camera
 from gridreg.rendering.model import Model
@@ -49,6 +50,11 @@ def render_video(
         InputError: for an unknown mode or suffix, without ffmpeg (MP4), or if the place is not writable.
     """
     check_target(Path(path), fps)
+    if cameras:
+        height, width = cameras[0].lens.height, cameras[0].lens.width
+        beside = (1 if isinstance(models, Model) else len(models)) * len(modes)
+        # Colour, depth and opacity as floats, and the frame that is made of them.
+        check_memory(40 * beside * height * width, f"frames of {width}x{height}")
     frames = render_frames(models, cameras, modes=modes, depths=depths)
     write_video(path, _reported(frames, len(cameras), progress), fps)
 

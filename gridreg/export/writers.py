@@ -28,8 +28,9 @@ def check_target(path: Path, fps: float) -> None:
     Raises:
         InputError: for another suffix or speed, without ffmpeg (MP4), or if the place is not writable.
     """
-    if not 0 < fps <= 1000:
-        raise InputError(f"fps={fps}: expected frames per second above 0")
+    if not 0.002 <= fps <= 1000:
+        # A GIF holds at most 655 seconds for a frame.
+        raise InputError(f"fps={fps}: expected frames per second above 0, from 0.002 to 1000")
     if path.suffix.lower() not in (".mp4", ".gif", ""):
         raise InputError(f"{path}: found suffix {path.suffix!r}, expected .mp4, .gif, or none for PNG frames")
     if path.suffix.lower() == ".mp4":

@@ -14,6 +14,7 @@ import gridreg
 from gridreg.base import Regularizer
 from gridreg.errors import InputError
 from gridreg.fields import make_field
+from gridreg.memory import check_memory
 from gridreg.scenes import IN_PLACE, Scene, builtin_scene, default_protocol, load_scene
 from gridreg.training.checkpoint import load_checkpoint, save_checkpoint
 from gridreg.training.config import to_data
@@ -63,6 +64,13 @@ def regularizers_of(config: RunConfig) -> list[Regularizer]:
 def build_trainer(config: RunConfig, scene: Scene) -> Trainer:
     """Field and trainer of a configuration, at step 0."""
     settings = config.train
+    check_memory(400 * settings.rays, f"train.rays={settings.rays}")
+    if config.backbone == "vm":
+        # Three planes of at least 16 components, with their gradients and two moments.
+        voxels = max(settings.voxels_start, settings.voxels_end)
+        check_memory(
+            768 * voxels ** (2 / 3), f"train.voxels_start, train.voxels_end: a grid of {voxels} voxels"
+        )
     bounds = carved_box(scene) if settings.carve and not scene.ndc else scene.bounds
     field = make_field(
         config.backbone,
