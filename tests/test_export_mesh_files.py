@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
+import struct
 
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ import torch
 import trimesh
 
 from gridreg.errors import InputError
-from gridreg.export.mesh import extract_mesh, read_mesh, save_mesh, write_mesh
+from gridreg.export.mesh import Mesh, extract_mesh, read_mesh, save_mesh, write_mesh
 from tests.export_fields import AnalyticField, ball, box
 
 
@@ -66,8 +68,8 @@ class TestFiles:
 
     def test_other_suffix_is_refused_before_any_work(self, tmp_path):
         field = AnalyticField(ball(0.5))
-        with pytest.raises(InputError, match=r"found suffix '.stl', expected one of .ply, .obj, .glb"):
-            write_mesh(field, tmp_path / "mesh.stl")
+        with pytest.raises(InputError, match=r"found suffix '.dae', expected one of .ply, .obj, .glb, .stl"):
+            write_mesh(field, tmp_path / "mesh.dae")
         assert field.largest_batch == 0
 
     def test_failed_write_leaves_what_stood_there(self, tmp_path, monkeypatch):
@@ -99,6 +101,52 @@ class TestFiles:
         other.write_text("hello")
         with pytest.raises(InputError, match=r"text\.xyzzy"):
             read_mesh(other)
+
+    def test_glb_is_as_the_standard_has_it(self, tmp_path):
+        corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]])
+        faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+        colours = np.array([[0, 0, 0], [10, 20, 30], [128, 64, 200], [255, 255, 255]], np.uint8)
+        path = tmp_path / "a.glb"
+        save_mesh(Mesh(corners, faces, colours), path)
+        content = path.read_bytes()
+        magic, version, length = struct.unpack("<4sII", content[:12])
+        assert (magic, version, length) == (b"glTF", 2, len(content))
+        size, kind = struct.unpack("<I4s", content[12:20])
+        assert kind == b"JSON"
+        assert size % 4 == 0
+        tree = json.loads(content[20 : 20 + size])
+        binary = content[28 + size :]
+        assert len(binary) == tree["buffers"][0]["byteLength"]
+
+        def array(number, dtype):
+            accessor = tree["accessors"][number]
+            view = tree["bufferViews"][accessor["bufferView"]]
+            assert view["byteOffset"] % 4 == 0
+            data = binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
+            return np.frombuffer(data, dtype).reshape(accessor["count"], -1)
+
+        primitive = tree["meshes"][0]["primitives"][0]
+        found = array(primitive["attributes"]["POSITION"], "<f4")
+        # The third corner was up by 3 and is so along y; what was away from the viewer goes to -z.
+        np.testing.assert_allclose(found, [[0, 0, 0], [1, 0, 0], [0, 0, -2], [0, 3, 0]])
+        position = tree["accessors"][primitive["attributes"]["POSITION"]]
+        assert (position["min"], position["max"]) == ([0, 0, -2], [1, 3, 0])
+        np.testing.assert_array_equal(array(primitive["indices"], "<u4").reshape(-1, 3), faces)
+        seen = array(primitive["attributes"]["COLOR_0"], "<f4")
+        # IEC 61966-2-1 by hand.
+        np.testing.assert_allclose(seen[2], [0.21586, 0.05127, 0.57758], atol=1e-5)
+        np.testing.assert_allclose(seen[1, 0], 10 / 255 / 12.92, rtol=1e-5)
+        back = read_mesh(path)
+        np.testing.assert_allclose(back.vertices, corners)
+        np.testing.assert_allclose(back.colours, colours, atol=7)
+        assert back.volume == pytest.approx(1.0)
+
+    def test_stl_is_closed_again(self, tmp_path):
+        mesh = write_mesh(AnalyticField(ball(0.6)), tmp_path / "a.stl", resolution=9)
+        back = read_mesh(tmp_path / "a.stl")
+        assert back.watertight
+        assert back.colours is None
+        assert back.volume == pytest.approx(mesh.volume, rel=1e-5)
 
     def test_mesh_without_colours(self, tmp_path):
         mesh = extract_mesh(AnalyticField(box((0.5, 0.4, 0.3))), resolution=17, colours=False)

@@ -16,7 +16,7 @@ class MeshOptions:
     checkpoint: Checkpoint
     """Output folder of a run, or its checkpoint."""
     out: OptionalFile = None
-    """File to write: .ply, .obj or .glb; default: mesh.ply in the run's folder."""
+    """File to write: .ply, .obj, .stl or .glb (y up); default: mesh.ply in the run's folder."""
     resolution: int = 256
     """Lattice nodes along the longest edge of the box; memory grows with the cube, 350 MB at 256."""
     threshold: OptionalFloat = None

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gridreg.errors import InputError
+from gridreg.export._glb import Y_UP, glb_of, srgb_of
 from gridreg.export.marching import Faces, Vertices, drop_small_components, polygonise, vertex_normals
 from gridreg.export.volume import SeenDensity, sample_density, surface_threshold
 from gridreg.memory import check_memory
@@ -27,10 +28,10 @@ from gridreg.training.files import check_output_folder, writing
 
 __all__ = ["MESH_SUFFIXES", "Mesh", "extract_mesh", "read_mesh", "save_mesh", "write_mesh"]
 
-MESH_SUFFIXES = (".ply", ".obj", ".glb")
+MESH_SUFFIXES = (".ply", ".obj", ".glb", ".stl")
 """Formats that `save_mesh` writes, by the suffix of the file's name."""
 
-READABLE = (*MESH_SUFFIXES, ".stl", ".off", ".gltf")
+READABLE = (*MESH_SUFFIXES, ".off", ".gltf")
 """Formats that `read_mesh` reads."""
 
 Colours = NDArray[np.uint8]
@@ -186,10 +187,10 @@ def _check_target(path: Path) -> None:
 
 
 def save_mesh(mesh: Mesh, path: str | Path) -> None:
-    """Write a mesh as PLY (binary), OBJ or GLB, by the suffix; whole or not at all. Folders are made.
+    """Write a mesh as PLY (binary), OBJ, GLB or STL, by the suffix; whole or not at all. Folders are made.
 
-    Coordinates are those of the world in every format: a GLB viewer that takes y for up shows a z-up scene
-    lying.
+    Coordinates are those of the world, but for GLB, which has y up and linear colours by its standard. STL has no
+    colours.
 
     Raises:
         InputError: for another suffix, or if the place is not writable or the disk is full.
@@ -197,7 +198,10 @@ def save_mesh(mesh: Mesh, path: str | Path) -> None:
     path = Path(path)
     _check_target(path)
     with writing(path) as temporary:
-        mesh.to_trimesh().export(temporary, file_type=path.suffix.lower()[1:])
+        if path.suffix.lower() == ".glb":
+            temporary.write_bytes(glb_of(mesh.vertices @ Y_UP.T, mesh.faces, mesh.colours))
+        else:
+            mesh.to_trimesh().export(temporary, file_type=path.suffix.lower()[1:])
 
 
 def write_mesh(
@@ -249,6 +253,9 @@ def read_mesh(path: str | Path) -> Mesh:
         with _quiet():
             loaded = trimesh.load_mesh(content, file_type=kind, process=False, skip_materials=True)
         mesh = loaded.to_mesh() if isinstance(loaded, trimesh.Scene) else loaded
+        if kind == "stl":
+            # It lists every triangle with corners of its own.
+            mesh.merge_vertices()
         vertices = np.asarray(mesh.vertices, dtype=np.float64)
         faces = np.asarray(mesh.faces, dtype=np.int64)
     # The readers of trimesh raise whatever their formats make them raise.
@@ -265,6 +272,8 @@ def read_mesh(path: str | Path) -> Mesh:
     visual: Any = mesh.visual
     if visual.kind == "vertex":
         colours = np.asarray(visual.vertex_colors, dtype=np.uint8)[:, :3]
+    if kind in ("glb", "gltf"):
+        vertices, colours = vertices @ Y_UP, None if colours is None else srgb_of(colours)
     return Mesh(vertices, faces, colours)
 
 
