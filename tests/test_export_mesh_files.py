@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import struct
+import sys
 
 import numpy as np
 import pytest
@@ -140,6 +141,31 @@ class TestFiles:
         np.testing.assert_allclose(back.vertices, corners)
         np.testing.assert_allclose(back.colours, colours, atol=7)
         assert back.volume == pytest.approx(1.0)
+
+    def test_at_most_so_many_faces_of_the_same_shape(self, tmp_path):
+        field = AnalyticField(ball(0.6))
+        full = write_mesh(field, tmp_path / "full.ply", resolution=33)
+        mesh = write_mesh(field, tmp_path / "few.ply", resolution=33, faces=600)
+        assert len(mesh.faces) <= 600 < len(full.faces)
+        assert mesh.watertight
+        assert mesh.volume == pytest.approx(full.volume, rel=0.02)
+        np.testing.assert_allclose(np.linalg.norm(mesh.vertices, axis=1), 0.6, atol=0.02)
+        # Colours follow: of the field they are those of a place.
+        place = np.clip(127.5 + 127.5 * mesh.vertices / 0.6, 0, 255)
+        before = np.clip(127.5 + 127.5 * full.vertices / 0.6, 0, 255)
+        slack = np.abs(full.colours.astype(float) - before).mean() + 6
+        assert np.abs(mesh.colours.astype(float) - place).mean() < slack
+        same = write_mesh(field, tmp_path / "same.ply", resolution=33, faces=10**6)
+        assert len(same.faces) == len(full.faces)
+
+    def test_faces_out_of_range_and_without_the_package(self, tmp_path, monkeypatch):
+        field = AnalyticField(ball(0.6))
+        with pytest.raises(InputError, match="faces=3: expected at least 4"):
+            write_mesh(field, tmp_path / "a.ply", faces=3)
+        monkeypatch.setitem(sys.modules, "fast_simplification", None)
+        with pytest.raises(InputError, match=r"expected: pip install 'gridreg\[train\]'"):
+            write_mesh(field, tmp_path / "a.ply", faces=10)
+        assert field.largest_batch == 0
 
     def test_stl_is_closed_again(self, tmp_path):
         mesh = write_mesh(AnalyticField(ball(0.6)), tmp_path / "a.stl", resolution=9)

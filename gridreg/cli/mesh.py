@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gridreg.cli.arguments import Checkpoint, OptionalFile, OptionalFloat
+from gridreg.cli.arguments import Checkpoint, OptionalFile, OptionalFloat, OptionalInt
 
 __all__ = ["MeshOptions", "run"]
 
@@ -23,6 +23,8 @@ class MeshOptions:
     """Density at the surface, per world unit; default: follows from the field."""
     min_component: float = 0.01
     """Parts with less surface than this share of the largest part's are dropped; 0 keeps all."""
+    faces: OptionalInt = None
+    """At most so many faces, such as 100000; default: as many as the resolution gives."""
     colours: bool = True
     """Colour the vertices as the field is seen along its normals."""
 
@@ -51,6 +53,7 @@ def run(options: MeshOptions) -> int:
         target,
         loaded.occupancy,
         resolution=options.resolution,
+        faces=options.faces,
         world=loaded.world,
         threshold=options.threshold,
         min_component=options.min_component,

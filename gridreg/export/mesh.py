@@ -18,6 +18,7 @@ from torch import Tensor
 
 from gridreg.errors import InputError
 from gridreg.export._glb import Y_UP, glb_of, srgb_of
+from gridreg.export.decimation import check_faces, decimate
 from gridreg.export.marching import Faces, Vertices, drop_small_components, polygonise, vertex_normals
 from gridreg.export.volume import SeenDensity, sample_density, surface_threshold
 from gridreg.memory import check_memory
@@ -210,6 +211,7 @@ def write_mesh(
     occupancy: OccupancyGrid | None = None,
     *,
     resolution: int = 256,
+    faces: int | None = None,
     world: World = IN_PLACE,
     **options: Any,
 ) -> Mesh:
@@ -220,6 +222,7 @@ def write_mesh(
         path: file to write; its suffix chooses the format.
         occupancy: as for `extract_mesh`.
         resolution: as for `extract_mesh`.
+        faces: at most so many; None: as they come.
         world: where the field's coordinates lie in the world of the scene's files.
         options: further arguments of `extract_mesh`.
 
@@ -228,7 +231,13 @@ def write_mesh(
     """
     # Before minutes of work, not after.
     _check_target(Path(path))
+    if faces is not None:
+        check_faces(faces)
     mesh = extract_mesh(field, occupancy, resolution=resolution, **options)
+    if faces is not None and len(mesh.faces) > faces:
+        vertices, triangles, nearest = decimate(mesh.vertices, mesh.faces, faces)
+        colours = None if mesh.colours is None else mesh.colours[nearest]
+        mesh = replace(mesh, vertices=vertices, faces=triangles, colours=colours)
     if world != IN_PLACE:
         mesh = replace(mesh, vertices=world.outward(mesh.vertices))
     save_mesh(mesh, path)
