@@ -138,6 +138,7 @@ class Regularizer:
         acts_on: the part of a declared site that `transform` acts on: "mask" (channel masks) or "grids"
             (low-passes).
         train_only: skip `transform` while the module that owns the tensor is in eval mode.
+        shown: the field whose number stands in tables and curves.
         ranges: lowest and highest value of fields that are numbers or schedules; None is let through.
 
     Two fields have a meaning where a subclass has them: `weight` is the factor of its penalties, and
@@ -146,6 +147,7 @@ class Regularizer:
 
     acts_on: ClassVar[Literal["mask", "grids"]] = "mask"
     train_only: ClassVar[bool] = False
+    shown: ClassVar[str] = "weight"
     ranges: ClassVar[Mapping[str, tuple[float, float]]] = {}
 
     def __post_init__(self) -> None:
@@ -249,8 +251,8 @@ class Regularizer:
     # --- telling -----------------------------------------------------------------------------------
 
     def value(self, context: Context) -> float:
-        """One number for tables and curves: by default the weight now, 1 for those without a weight."""
-        return context.at(getattr(self, "weight", 1.0), "weight")
+        """One number for tables and curves: that of the field `shown` now, 1 for those without it."""
+        return self.now(self.shown, context) if hasattr(self, self.shown) else 1.0
 
     @classmethod
     def examples(cls, site: SiteLike) -> list[Regularizer]:

@@ -13,7 +13,7 @@ from gridreg.base import Context, Regularizer, register, within
 from gridreg.errors import InputError
 from gridreg.regularizers import mask_functions as masks
 from gridreg.regularizers.mask_base import Mask
-from gridreg.schedules import Linear, Numeric, check_until, fixed_end
+from gridreg.schedules import Linear, Numeric
 
 __all__ = ["CosineMask", "FixedMask", "FrequencyMask"]
 
@@ -47,7 +47,6 @@ class FrequencyMask(Mask):
     def __post_init__(self) -> None:
         """Refuse what no run could use."""
         super().__post_init__()
-        check_until(self.until)
         if self.block is not None and (isinstance(self.block, bool) or not self.block >= 1):
             raise InputError(f"block={self.block!r}: expected a number of channels, an int above 0, or None")
 
@@ -75,10 +74,6 @@ class FrequencyMask(Mask):
         if self.variant == "authors":
             return masks.authors_frequency_mask(count, context.step, end, block=min(self.block or 5, count))
         return masks.frequency_mask(count, context.step, end, block=min(self.block or 1, count))
-
-    def end(self, count: int, total_steps: int) -> int | None:
-        """The step that `until` stands for."""
-        return fixed_end(self.until, total_steps)
 
     def monotone(self) -> bool:
         """Not in the printed form."""
@@ -148,11 +143,6 @@ class CosineMask(Mask):
 
     until: Numeric = 0.9
 
-    def __post_init__(self) -> None:
-        """Refuse what no run could use."""
-        super().__post_init__()
-        check_until(self.until)
-
     def ranks(self, place: Place) -> tuple[int, ...]:
         """By octave where known; rank 0 is the identity's, whether or not the site has it."""
         without = place.octaves is not None and min(place.octaves, default=0) >= 0
@@ -164,10 +154,6 @@ class CosineMask(Mask):
             return torch.ones(1)
         window = masks.cosine_mask(count - 1, context.step, context.end(self.until))
         return torch.cat([torch.ones(1), window])
-
-    def end(self, count: int, total_steps: int) -> int | None:
-        """The step that `until` stands for."""
-        return fixed_end(self.until, total_steps)
 
     @classmethod
     def examples(cls, site: SiteLike) -> list[Regularizer]:

@@ -11,6 +11,7 @@ from torch import Tensor
 from gridreg.attach.sites import SiteLike
 from gridreg.base import NOT_NEGATIVE, Context, Regularizer, register
 from gridreg.errors import InputError
+from gridreg.regularizers.penalty_base import SamplesPenalty
 from gridreg.samples import RaySamples
 from gridreg.schedules import Numeric
 
@@ -173,7 +174,7 @@ class OcclusionLoss(Regularizer):
 
 @register
 @dataclass(frozen=True)
-class CauchySparsity(Regularizer):
+class CauchySparsity(SamplesPenalty):
     """Density anywhere is penalised, large values little more than middling ones: see `cauchy_sparsity`.
 
     Args:
@@ -185,20 +186,12 @@ class CauchySparsity(Regularizer):
     """
 
     weight: Numeric = 1e-11
-
-    def penalty(self, samples: RaySamples, context: Context) -> Tensor:
-        """`cauchy_sparsity`."""
-        return cauchy_sparsity(samples)
-
-    @classmethod
-    def examples(cls, site: SiteLike) -> list[Regularizer]:
-        """At its default."""
-        return [cls()]
+    function = staticmethod(cauchy_sparsity)
 
 
 @register
 @dataclass(frozen=True)
-class Eikonal(Regularizer):
+class Eikonal(SamplesPenalty):
     """The gradient of a signed distance should have length 1: see `eikonal`.
 
     Args:
@@ -210,16 +203,5 @@ class Eikonal(Regularizer):
     """
 
     weight: Numeric = 0.1
-
-    def needs(self) -> tuple[str, ...]:
-        """Gradients of the distance."""
-        return ("gradients",)
-
-    def penalty(self, samples: RaySamples, context: Context) -> Tensor:
-        """`eikonal`."""
-        return eikonal(samples)
-
-    @classmethod
-    def examples(cls, site: SiteLike) -> list[Regularizer]:
-        """At its default."""
-        return [cls()]
+    function = staticmethod(eikonal)
+    required = ("gradients",)

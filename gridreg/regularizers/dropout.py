@@ -61,6 +61,7 @@ class ComponentDropout(Regularizer):
 
     site: SiteLike
     p: Numeric = _RAMP
+    shown = "p"
     ranges = within(p=(0.0, _HIGHEST))
 
     def prepare(self, context: Context) -> None:
@@ -79,10 +80,6 @@ class ComponentDropout(Regularizer):
         """Multiply the channels by their factors."""
         factors = broadcast(context, "factors", value)
         return torch.where(factors > 0, value * factors, 0.0)
-
-    def value(self, context: Context) -> float:
-        """Probability now."""
-        return self.now("p", context)
 
     @classmethod
     def examples(cls, site: SiteLike) -> list[Regularizer]:

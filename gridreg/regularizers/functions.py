@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import Any, TypeAlias
 
 import torch
@@ -46,7 +47,7 @@ def from_function(
     """
     name = f"{getattr(function, '__module__', None)}:{getattr(function, '__qualname__', None)}"
     try:
-        kept = name if not isinstance(function, str) and _imported(name) is function else function
+        kept = name if not isinstance(function, str) and _found(name) is function else function
     except InputError:
         kept = function
     if isinstance(where, str) and where.partition(".")[0] == "samples":
@@ -54,26 +55,24 @@ def from_function(
     return GridFunction(kept, where, weight)
 
 
-def _imported(name: str) -> Function:
-    """The function of a module.
+def _found(function: Any) -> Function:
+    """The function itself, or that of a module.
 
     Raises:
         InputError: there is none.
     """
-    module, _, path = name.partition(":")
-    try:
-        found: Any = importlib.import_module(module)
-        for part in path.split("."):
-            found = getattr(found, part)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise InputError(f"function={name!r}: expected 'module:name' of a function ({error})") from None
-    return _callable(found)
-
-
-def _callable(function: Any) -> Function:
-    if not callable(function):
+    found = function
+    if isinstance(function, str):
+        module, _, path = function.partition(":")
+        try:
+            found = attrgetter(path)(importlib.import_module(module))
+        except (ImportError, AttributeError, ValueError) as error:
+            raise InputError(
+                f"function={function!r}: expected 'module:name' of a function ({error})"
+            ) from None
+    if not callable(found):
         raise InputError(f"function={function!r}: expected a function of one argument, or 'module:name'")
-    checked: Function = function
+    checked: Function = found
     return checked
 
 
@@ -86,13 +85,10 @@ class _FunctionPenalty(Regularizer):
     def __post_init__(self) -> None:
         """Refuse at once what can be refused before the first step."""
         super().__post_init__()
-        self._found()
-
-    def _found(self) -> Function:
-        return _imported(self.function) if isinstance(self.function, str) else _callable(self.function)
+        _found(self.function)
 
     def _value(self, argument: Any) -> Tensor:
-        value = self._found()(argument)
+        value = _found(self.function)(argument)
         if not isinstance(value, Tensor):
             raise InputError(f"{self.function}: returned {type(value).__name__}, expected a tensor")
         return value.mean() if value.numel() else value.sum()

@@ -94,6 +94,7 @@ class DistanceGradientScaling(Regularizer):
     """
 
     distance: Numeric = 1.0
+    shown = "distance"
     ranges = within(distance=NOT_NEGATIVE)
 
     def __post_init__(self) -> None:
@@ -105,10 +106,6 @@ class DistanceGradientScaling(Regularizer):
     def on_samples(self, samples: RaySamples, context: Context) -> RaySamples:
         """`scale_gradients_by_distance` with the distance of this step."""
         return scale_gradients_by_distance(samples, self.now("distance", context))
-
-    def value(self, context: Context) -> float:
-        """Distance from which on gradients count in full."""
-        return self.now("distance", context)
 
     @classmethod
     def examples(cls, site: SiteLike) -> list[Regularizer]:

@@ -13,7 +13,7 @@ from gridreg.base import NOT_NEGATIVE, Context, Regularizer, register, within
 from gridreg.errors import InputError
 from gridreg.regularizers import mask_functions as masks
 from gridreg.regularizers.mask_base import Mask
-from gridreg.schedules import Linear, Numeric, check_until, end_step, fixed_end
+from gridreg.schedules import Linear, Numeric, check_until, end_step
 
 __all__ = ["LevelMask", "ViewDependenceMask"]
 
@@ -115,8 +115,6 @@ class ViewDependenceMask(Mask):
     def __post_init__(self) -> None:
         """Refuse what no run could use."""
         super().__post_init__()
-        if self.until is not None:
-            check_until(self.until)
         if self.coefficients is not None and (
             isinstance(self.coefficients, bool) or not self.coefficients >= 1
         ):
@@ -133,10 +131,6 @@ class ViewDependenceMask(Mask):
         if self.until is not None and context.step >= context.end(self.until):
             return torch.ones(count)
         return (torch.arange(count) < math.floor(self.now("bands", context))).float()
-
-    def end(self, count: int, total_steps: int) -> int | None:
-        """The step that `until` stands for."""
-        return None if self.until is None else fixed_end(self.until, total_steps)
 
     @classmethod
     def examples(cls, site: SiteLike) -> list[Regularizer]:

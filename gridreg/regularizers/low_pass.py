@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
@@ -50,53 +49,52 @@ def annealed_radius(
 
 @dataclass(frozen=True)
 class _GridFilter(Regularizer):
-    """What both low-passes share: they act on grids, by one number that they keep in the state."""
+    """Base of both low-passes: they act on grids, by one number that is kept in the state."""
 
     acts_on: ClassVar[Literal["mask", "grids"]] = "grids"
+    open_at: ClassVar[float] = 0.0
 
     def number(self, context: Context) -> float:
         """What the filter depends on at this step."""
         return 0.0
+
+    def filtered(self, values: Tensor, axes: tuple[int, ...], number: float | Tensor) -> Tensor:
+        """Values filtered along their spatial axes."""
+        return values
 
     def prepare(self, context: Context) -> None:
         """Keep the number of this step."""
         if context.place is not None and not context.place.spatial:
             raise InputError(f"{context.place.name}: {NO_NEIGHBOURS}")
         number = torch.tensor(self.number(context), dtype=torch.float64)
-        if "number" in context.state:
-            context.state["number"].copy_(number)
-        else:
-            context.state["number"] = number
+        context.state.setdefault("number", number).copy_(number)
+
+    def is_identity(self, context: Context) -> bool:
+        """The number is that at which everything passes."""
+        return float(context.state["number"]) == self.open_at
+
+    def transform(self, value: Tensor, context: Context) -> Tensor:
+        """The grid with what takes part, some channels or one grid of a stack, filtered."""
+        place, number = context.place, context.state["number"]
+        if place is None:
+            return value
+        item = place.selector.item
+        chosen = [(place.dim, place.selected), (place.stack, None if item is None else (item,))]
+        parts, indices = [value], []
+        for axis, selected in chosen:
+            if axis is not None and selected is not None:
+                indices.append((axis, torch.tensor(selected, device=value.device)))
+                parts.append(parts[-1].index_select(*indices[-1]))
+        # While compiling as a tensor, so that the next step needs no new code.
+        now = number if torch.compiler.is_compiling() else float(number)
+        result = self.filtered(parts[-1], place.spatial, now)
+        for part, (axis, index) in zip(parts[-2::-1], reversed(indices), strict=True):
+            result = part.index_copy(axis, index, result)
+        return result
 
     def value(self, context: Context) -> float:
         """The number now."""
         return self.number(context)
-
-
-def _number(context: Context) -> float | Tensor:
-    """The number of this step; while compiling as a tensor, so that the next step needs no new code."""
-    number = context.state["number"]
-    return number if torch.compiler.is_compiling() else float(number)
-
-
-def _filtered(
-    value: Tensor, context: Context, function: Callable[[Tensor, tuple[int, ...]], Tensor]
-) -> Tensor:
-    """The grid with what takes part, some channels or one grid of a stack, filtered."""
-    place = context.place
-    if place is None:
-        return value
-    item = place.selector.item
-    chosen = [(place.dim, place.selected), (place.stack, None if item is None else (item,))]
-    parts, indices = [value], []
-    for axis, selected in chosen:
-        if axis is not None and selected is not None:
-            indices.append((axis, torch.tensor(selected, device=value.device)))
-            parts.append(parts[-1].index_select(*indices[-1]))
-    result = function(parts[-1], place.spatial)
-    for part, (axis, index) in zip(parts[-2::-1], reversed(indices), strict=True):
-        result = part.index_copy(axis, index, result)
-    return result
 
 
 @register
@@ -128,20 +126,16 @@ class FourierLowPass(_GridFilter):
     site: SiteLike
     keep: Numeric = _FOURIERF_KEEP
     boundary: Boundary = "periodic"
+    open_at = 1.0
     ranges = within(keep=(0.0, 1.0))
 
     def number(self, context: Context) -> float:
         """Share of the spectrum."""
         return self.now("keep", context)
 
-    def is_identity(self, context: Context) -> bool:
-        """The whole spectrum passes."""
-        return float(context.state["number"]) == 1
-
-    def transform(self, value: Tensor, context: Context) -> Tensor:
-        """The grid without its high frequencies."""
-        keep = _number(context)
-        return _filtered(value, context, lambda v, axes: fourier_low_pass(v, axes, keep, self.boundary))
+    def filtered(self, values: Tensor, axes: tuple[int, ...], number: float | Tensor) -> Tensor:
+        """Values without their high frequencies."""
+        return fourier_low_pass(values, axes, number, self.boundary)
 
     @classmethod
     def examples(cls, site: SiteLike) -> list[Regularizer]:
@@ -187,14 +181,9 @@ class GridBlur(_GridFilter):
         rounds = int(self.now("rounds", context))
         return annealed_radius(context.step, context.end(self.until), rounds=rounds, **now)
 
-    def is_identity(self, context: Context) -> bool:
-        """The radius is 0."""
-        return float(context.state["number"]) == 0
-
-    def transform(self, value: Tensor, context: Context) -> Tensor:
-        """The blurred grid."""
-        radius = _number(context)
-        return _filtered(value, context, lambda v, axes: gaussian_blur(v, axes, radius))
+    def filtered(self, values: Tensor, axes: tuple[int, ...], number: float | Tensor) -> Tensor:
+        """Blurred values."""
+        return gaussian_blur(values, axes, number)
 
     @classmethod
     def examples(cls, site: SiteLike) -> list[Regularizer]:

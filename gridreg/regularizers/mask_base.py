@@ -14,6 +14,7 @@ from gridreg.attach.sites import Place, SiteLike
 from gridreg.base import Context, Regularizer
 from gridreg.errors import InputError
 from gridreg.regularizers.mask_functions import channel_ranks
+from gridreg.schedules import check_until, fixed_end
 
 __all__ = ["Mask", "broadcast", "remember", "spread"]
 
@@ -32,6 +33,15 @@ class Mask(Regularizer):
     site: SiteLike
     detach: bool = field(default=False, kw_only=True)
 
+    def __post_init__(self) -> None:
+        """Refuse what no run could use."""
+        super().__post_init__()
+        if self._until() is not None:
+            check_until(self._until())
+
+    def _until(self) -> Any:
+        return getattr(self, "until", None)
+
     def ranks(self, place: Place) -> tuple[int, ...]:
         """Rank of each channel, low ranks open first: by octave where known, else by index."""
         return channel_ranks(place.octaves or tuple(range(place.channels or 0)))
@@ -41,8 +51,8 @@ class Mask(Regularizer):
         return torch.ones(count)
 
     def end(self, count: int, total_steps: int) -> int | None:
-        """Step from which all of `count` ranks are open, None if that never is or cannot be told."""
-        return None
+        """Step from which all of `count` ranks are open (that of `until`), None if that never is or cannot be told."""
+        return None if self._until() is None else fixed_end(self._until(), total_steps)
 
     def monotone(self) -> bool:
         """Whether it never opens a higher rank more than a lower one, and never closes again."""

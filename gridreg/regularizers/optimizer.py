@@ -87,6 +87,7 @@ class WeightDecay(Regularizer):
 
     site: SiteLike
     decay: Numeric = 0.2
+    shown = "decay"
     ranges = within(decay=NOT_NEGATIVE)
 
     def parameter_groups(self, groups: Groups, grids: Sequence[Grid], context: Context) -> Groups:
@@ -101,10 +102,6 @@ class WeightDecay(Regularizer):
         """The decay of this step."""
         for group in _groups_of(groups, grids):
             group["weight_decay"] = self.value(context)
-
-    def value(self, context: Context) -> float:
-        """Decay now."""
-        return self.now("decay", context)
 
     @classmethod
     def examples(cls, site: SiteLike) -> list[Regularizer]:
@@ -137,6 +134,7 @@ class LearningRate(Regularizer):
 
     site: SiteLike
     scale: Numeric = 1.0
+    shown = "scale"
     ranges = within(scale=(_LOWEST_SCALE, float("inf")))
 
     def parameter_groups(self, groups: Groups, grids: Sequence[Grid], context: Context) -> Groups:
@@ -161,10 +159,6 @@ class LearningRate(Regularizer):
         for name in ("lr", "initial_lr"):
             if name in group and ratio != 1:
                 group[name] = group[name] * ratio
-
-    def value(self, context: Context) -> float:
-        """Factor now."""
-        return self.now("scale", context)
 
     @classmethod
     def examples(cls, site: SiteLike) -> list[Regularizer]:

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from torch import Tensor
 from torch.nn import functional as F
 
-from gridreg.attach.sites import SiteLike
-from gridreg.base import Context, Regularizer, register
+from gridreg.base import register
 from gridreg.errors import InputError
+from gridreg.regularizers.penalty_base import SamplesPenalty
 from gridreg.regularizers.rays import TINY, alpha_of
 from gridreg.samples import RaySamples
 from gridreg.schedules import Geometric, Numeric
@@ -132,7 +132,7 @@ def ray_kl(samples: RaySamples) -> Tensor:
 
 @register
 @dataclass(frozen=True)
-class DepthSmoothness(Regularizer):
+class DepthSmoothness(SamplesPenalty):
     """Steps of depth between neighbouring rays of unseen patches are penalised: see `depth_smoothness`.
 
     Args:
@@ -148,24 +148,13 @@ class DepthSmoothness(Regularizer):
     """
 
     weight: Numeric = _REGNERF_WEIGHT
-
-    def needs(self) -> tuple[str, ...]:
-        """Patches."""
-        return ("patch",)
-
-    def penalty(self, samples: RaySamples, context: Context) -> Tensor:
-        """`depth_smoothness`."""
-        return depth_smoothness(samples)
-
-    @classmethod
-    def examples(cls, site: SiteLike) -> list[Regularizer]:
-        """At its default."""
-        return [cls()]
+    function = staticmethod(depth_smoothness)
+    required = ("patch",)
 
 
 @register
 @dataclass(frozen=True)
-class NormalSmoothness(Regularizer):
+class NormalSmoothness(SamplesPenalty):
     """Bends between neighbouring rays of patches are penalised: see `normal_smoothness`.
 
     Args:
@@ -177,24 +166,13 @@ class NormalSmoothness(Regularizer):
     """
 
     weight: Numeric = 0.01
-
-    def needs(self) -> tuple[str, ...]:
-        """Gradients and patches."""
-        return ("gradients", "patch")
-
-    def penalty(self, samples: RaySamples, context: Context) -> Tensor:
-        """`normal_smoothness`."""
-        return normal_smoothness(samples)
-
-    @classmethod
-    def examples(cls, site: SiteLike) -> list[Regularizer]:
-        """At its default."""
-        return [cls()]
+    function = staticmethod(normal_smoothness)
+    required = ("gradients", "patch")
 
 
 @register
 @dataclass(frozen=True)
-class RayKL(Regularizer):
+class RayKL(SamplesPenalty):
     """Neighbouring rays should meet matter at the same steps: see `ray_kl`.
 
     Args:
@@ -206,16 +184,5 @@ class RayKL(Regularizer):
     """
 
     weight: Numeric = 1e-5
-
-    def needs(self) -> tuple[str, ...]:
-        """Patches."""
-        return ("patch",)
-
-    def penalty(self, samples: RaySamples, context: Context) -> Tensor:
-        """`ray_kl`."""
-        return ray_kl(samples)
-
-    @classmethod
-    def examples(cls, site: SiteLike) -> list[Regularizer]:
-        """At its default."""
-        return [cls()]
+    function = staticmethod(ray_kl)
+    required = ("patch",)

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gridreg.attach.sites import SiteLike
-from gridreg.base import Context, Regularizer, register
+from gridreg.base import register
 from gridreg.errors import InputError
+from gridreg.regularizers.penalty_base import SamplesPenalty
 from gridreg.samples import RaySamples
 from gridreg.schedules import Numeric
 
@@ -78,7 +78,7 @@ def _ends(samples: RaySamples, share: float = 1.0) -> tuple[Tensor, Tensor]:
 
 @register
 @dataclass(frozen=True)
-class ProposalLoss(Regularizer):
+class ProposalLoss(SamplesPenalty):
     """Proposal networks are drawn to cover what the final samples found: see `proposal_loss`.
 
     Args:
@@ -90,16 +90,5 @@ class ProposalLoss(Regularizer):
     """
 
     weight: Numeric = 1.0
-
-    def needs(self) -> tuple[str, ...]:
-        """The proposals' samples."""
-        return ("proposals",)
-
-    def penalty(self, samples: RaySamples, context: Context) -> Tensor:
-        """`proposal_loss`."""
-        return proposal_loss(samples)
-
-    @classmethod
-    def examples(cls, site: SiteLike) -> list[Regularizer]:
-        """At its default."""
-        return [cls()]
+    function = staticmethod(proposal_loss)
+    required = ("proposals",)

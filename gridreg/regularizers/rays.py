@@ -12,6 +12,7 @@ from torch.autograd.function import once_differentiable
 from gridreg.attach.sites import SiteLike
 from gridreg.base import Context, Regularizer, register, within
 from gridreg.errors import InputError
+from gridreg.regularizers.penalty_base import SamplesPenalty
 from gridreg.samples import RaySamples
 from gridreg.schedules import Numeric
 from gridreg.segments import before_less_behind
@@ -153,7 +154,7 @@ def distortion(samples: RaySamples, near: float | None = None, far: float | None
 
 @register
 @dataclass(frozen=True)
-class OpacityEntropy(Regularizer):
+class OpacityEntropy(SamplesPenalty):
     """Rays half opaque are penalised: see `opacity_entropy`.
 
     Args:
@@ -165,15 +166,7 @@ class OpacityEntropy(Regularizer):
     """
 
     weight: Numeric = 1e-3
-
-    def penalty(self, samples: RaySamples, context: Context) -> Tensor:
-        """`opacity_entropy`."""
-        return opacity_entropy(samples)
-
-    @classmethod
-    def examples(cls, site: SiteLike) -> list[Regularizer]:
-        """At its default."""
-        return [cls()]
+    function = staticmethod(opacity_entropy)
 
 
 @register
