@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import functools
 import math
 import types
 import typing
@@ -21,6 +22,8 @@ from gridreg.training.strict_yaml import Document
 __all__ = ["alternatives", "field_types", "from_data", "to_data"]
 
 T = TypeVar("T")
+# A thousand runs of a store are a thousand times the same class.
+_type_hints = functools.cache(typing.get_type_hints)
 
 # Of integers: what NumPy, torch and SQLite can hold.
 _LARGEST = 2**63 - 1
@@ -98,7 +101,7 @@ def to_data(value: Any) -> Any:
 
 def field_types(cls: type[Any]) -> dict[str, Any]:
     """The declared type of every field that a dataclass takes when it is built."""
-    hints = typing.get_type_hints(cls)
+    hints = _type_hints(cls)  # type: ignore[arg-type]
     return {f.name: hints[f.name] for f in dataclasses.fields(cls) if f.init}
 
 
