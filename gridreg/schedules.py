@@ -40,7 +40,7 @@ class Schedule:
 
 
 Numeric: TypeAlias = float | int | Schedule | Callable[[int], float]
-"""What every numeric argument accepts."""
+"""Type of every numeric argument."""
 
 ScheduleClass = TypeVar("ScheduleClass", bound=type[Schedule])
 

@@ -83,7 +83,7 @@ def opacity_error(samples: RaySamples) -> Tensor:
 class RandomBackground(Regularizer):
     """The same random colour behind render and target, new at each step: see `random_background`.
 
-    It needs training pictures with transparency, and rays of the batch composited on `handle.background`.
+    It needs training images with transparency, and rays of the batch composited on `handle.background`.
 
     Args:
         per: "ray": each its own colour; "batch": one colour for all.
@@ -123,7 +123,7 @@ class RandomBackground(Regularizer):
 @register
 @dataclass(frozen=True)
 class ExpectedBackground(Regularizer):
-    """What random backgrounds cost on average, without the noise of drawing them: see `RandomBackground`.
+    """Random backgrounds in expectation, without the noise of drawing them: see `RandomBackground`.
 
     Let a pixel be off by ``e`` in its colour before black and by ``d`` in its opacity. Before a background ``b`` it
     is off by ``e - d b``, and over all ``b`` in [0, 1]^3 the mean of its square, per channel, is

@@ -138,7 +138,7 @@ class SamplesFunction(_FunctionPenalty):
 
     @classmethod
     def examples(cls, site: SiteLike) -> list[Regularizer]:
-        """Of an attribute, and of all."""
+        """One of an attribute, and one of the whole samples."""
         return [
             cls("torch:square", "samples.opacity"),
             cls("gridreg.regularizers.density:cauchy_sparsity"),
@@ -172,5 +172,5 @@ class GridFunction(_FunctionPenalty):
 
     @classmethod
     def examples(cls, site: SiteLike) -> list[Regularizer]:
-        """Of the values."""
+        """The square of the values."""
         return [cls("torch:square", site)]

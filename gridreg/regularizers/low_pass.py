@@ -55,7 +55,7 @@ class _GridFilter(Regularizer):
     open_at: ClassVar[float] = 0.0
 
     def number(self, context: Context) -> float:
-        """What the filter depends on at this step."""
+        """The number that the filter depends on at this step."""
         return 0.0
 
     def filtered(self, values: Tensor, axes: tuple[int, ...], number: float | Tensor) -> Tensor:

@@ -1,5 +1,4 @@
-"""What all channel masks share: ranks of channels, multiplication at a site, closed channels without
-effect."""
+"""Base of all channel masks: ranks of channels, multiplication at a site, closed channels without effect."""
 
 from __future__ import annotations
 
@@ -82,7 +81,7 @@ class Mask(Regularizer):
         return end is not None and context.step >= end
 
     def closed_channels(self, context: Context) -> Tensor | None:
-        """Where the mask is 0; not told of one grid of a stack."""
+        """Channels at which the mask is 0; not told of one grid of a stack."""
         closed: Tensor = context.state["mask"] <= 0
         return None if self.detach or _item(context) is not None else closed
 

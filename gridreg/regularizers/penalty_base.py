@@ -1,4 +1,4 @@
-"""What penalties that are a plain function of the samples share."""
+"""Base of penalties that are a plain function of the samples."""
 
 from __future__ import annotations
 

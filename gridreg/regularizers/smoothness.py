@@ -197,7 +197,7 @@ class TotalVariation(Regularizer):
 @register
 @dataclass(frozen=True)
 class TimeSmoothness(Regularizer):
-    """What a grid holds should move steadily in time: see `time_smoothness`.
+    """Values of a grid should change steadily in time: see `time_smoothness`.
 
     Added over the grids of the site. Unlike total variation along the axis of time it lets steady motion be.
 
