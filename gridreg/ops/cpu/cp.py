@@ -6,7 +6,7 @@ A gradient task owns nodes of one line, and computes the product of the other tw
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -100,25 +100,18 @@ def _features(
     _forward(task, u, (x, y, z), read, nodes, fractions, out, False)
 
 
-class _Target(NamedTuple):
-    """Arrays that the gradients of the nodes below and above a sample are added to, and where channels begin."""
-
-    lower: Any
-    lower_first: Any
-    upper: Any
-    upper_first: Any
-
-
 @inline
-def _add(others: Any, segments: Any, fraction: Any, c: int, g: Any, to: Any, dtype_like: Any) -> None:
-    """Add the gradient of channels from ``c`` on of a sample to two nodes; ``others`` are the other two lines."""
-    value = linear(others[0], segments[0], c, dtype_like) * g
-    value = value * linear(others[1], segments[1], c, dtype_like)
-    i, j = to.lower_first + c, to.upper_first + c
-    below = load(to.lower, i, dtype_like) + value * (float32(1) - fraction)
-    above = load(to.upper, j, dtype_like) + value * fraction
-    store(to.lower, i, below)
-    store(to.upper, j, above)
+def _add(
+    first: Any, second: Any, segments: Any, fraction: Any, c: int, g: Any, lower: Any, i: int, upper: Any, j: int,
+    dtype_like: Any,
+) -> None:  # fmt: skip
+    """Add the gradient of channels from ``c`` on of a sample to the nodes at ``i`` and ``j``, from the other lines."""
+    value = linear(first, segments[0], c, dtype_like) * g
+    value = value * linear(second, segments[1], c, dtype_like)
+    below = load(lower, i + c, dtype_like) + value * (float32(1) - fraction)
+    above = load(upper, j + c, dtype_like) + value * fraction
+    store(lower, i + c, below)
+    store(upper, j + c, above)
 
 
 @inline
@@ -128,7 +121,7 @@ def _backward(
     """Add the gradients that one task owns; ``lines`` and ``gradients`` along x, y and z."""
     axis, part = task // TASKS, task % TASKS
     b, c_ = 1 if axis == 0 else 0, 1 if axis == 2 else 2
-    others, own, (starts, nodes, fractions) = (lines[b], lines[c_]), gradients[axis], listing
+    line_b, line_c, own, (starts, nodes, fractions) = lines[b], lines[c_], gradients[axis], listing
     samples, stride = nodes.shape[0] // (3 * ENTRY), starts.shape[0] // 3
     channels, far, blocks = lines[0].shape[1], ENTRY * lookahead(read), read - read % LANES
     for third in range(3):
@@ -145,19 +138,15 @@ def _backward(
                 Segment(int64(nodes[e + c_]) * channels, channels, fractions[e + c_]),
             )
             below, fraction, g = int64(nodes[e + axis]) * channels, fractions[e + axis], fractions[e + 3]
-            to = _Target(
-                to_lower,
-                below if lower else task * channels,
-                to_upper,
-                below + channels if upper else task * channels,
-            )
+            i = below if lower else task * channels
+            j = below + channels if upper else task * channels
             n = int64(nodes[e + 3]) * channels
             for c in range(0, blocks, LANES):
                 gc = vector_zero() + g if summed else load(upstream, n + c, vector_zero())
-                _add(others, segments, fraction, c, gc, to, vector_zero())
+                _add(line_b, line_c, segments, fraction, c, gc, to_lower, i, to_upper, j, vector_zero())
             for c in range(blocks, read):
                 gc = g if summed else load(upstream, n + c, scalar_zero())
-                _add(others, segments, fraction, c, gc, to, scalar_zero())
+                _add(line_b, line_c, segments, fraction, c, gc, to_lower, i, to_upper, j, scalar_zero())
 
 
 @kernel

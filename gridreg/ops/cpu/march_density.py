@@ -77,21 +77,24 @@ def _march_ray(
     """Fill density of the samples of a ray until it is opaque, and return how many can be seen."""
     begin, end = rays.offsets[ray], rays.offsets[ray + 1]
     channels, shape, step = lines[0].shape[1], shape_of(lines), density_of.step
+    nodes, fractions, cells = samples.nodes, samples.fractions, samples.cells
     depth, index = float32(0), int64(-1)
     for first in range(begin, end, _SPAN):
         count = min(int64(_SPAN), end - first)
         index = _place(rays, ray, index, count, density_of, u)
-        locate(samples.nodes, samples.fractions, u, 0, count, shape)
+        locate(nodes, fractions, u, 0, count, shape)
         if planar:
             find_cells(samples, count, shape, channels)
         for start in range(0, count, _GROUP):
             stop = min(start + _GROUP, count)
             if planar:
-                for k in range(3):
-                    look_up(planes, lines, k, samples, (start, stop, count), read, features, 0, True)
+                part = start, stop, count
+                look_up(planes[0], lines[0], 0, nodes, fractions, cells, part, read, features, 0, True)
+                look_up(planes[1], lines[1], 1, nodes, fractions, cells, part, read, features, 0, True)
+                look_up(planes[2], lines[2], 2, nodes, fractions, cells, part, read, features, 0, True)
             else:
                 for q in range(start, stop):
-                    segments = segments_of(samples.nodes, samples.fractions, q, channels)
+                    segments = segments_of(nodes, fractions, q, channels)
                     features[q] = product_sum((lines[2], lines[1], lines[0]), segments, read)
             # The last group of a ray is filled up with leftovers.
             values = (

@@ -81,21 +81,20 @@ def find_cells(samples: Any, count: int, shape: tuple[int, int, int], channels: 
             samples.cells[k * BATCH + q] = node * width
 
 
+# Arrays come as arguments of their own: numba counts references to those in a tuple, at each call.
 @inline
 def look_up(
-    planes: Any, lines: Any, k: int, samples: Any, part: tuple[int, int, int], read: int, out: Any, n: int,
-    summed: bool,
+    plane: Any, line: Any, k: int, nodes: Any, fractions: Any, cells: Any, part: tuple[int, int, int], read: int,
+    out: Any, n: int, summed: bool,
 ) -> None:  # fmt: skip
     """Product of plane and line ``k`` at a part (start, stop, count) of a batch whose first sample is ``n``.
 
     If ``summed``, its sum over channels is added to ``out``, else its channels are written one after another.
     """
     start, stop, count = part
-    plane, line = planes[k], lines[k]
     channels, (a, b, v) = line.shape[1], axes(k)
     down, far = plane.shape[1] * channels, lookahead(read)
     first, a, b, v = k * BATCH, a * BATCH, b * BATCH, v * BATCH
-    nodes, fractions, cells = samples.nodes, samples.fractions, samples.cells
     for q in range(start, stop):
         if q + far < count:
             prefetch_cell(plane, int64(cells[first + q + far]), channels, down, read)
@@ -118,7 +117,10 @@ def _forward(
     locate(samples.nodes, samples.fractions, u, first, count, shape)
     find_cells(samples, count, shape, lines[0].shape[1])
     for k in range(3):
-        look_up(planes, lines, k, samples, (0, count, count), read, out, first, summed)
+        look_up(
+            planes[k], lines[k], k, samples.nodes, samples.fractions, samples.cells, (0, count, count), read, out,
+            first, summed,
+        )  # fmt: skip
 
 
 @kernel

@@ -33,28 +33,16 @@ from gridreg.ops.cpu.reductions import reduce_sum
 __all__ = ["density_backward", "features_backward"]
 
 
-class _Target(NamedTuple):
-    """The elements to which the gradient of a sample is added: arrays, and the one of each at which its channels begin.
-
-    ``lower`` and ``upper`` are for the two rows of the plane that the sample lies between. What falls on a row of
-    another task, which sees the sample too, goes to an array that nobody reads.
-    """
-
-    lower: Any
-    lower_first: Any
-    upper: Any
-    upper_first: Any
-    line: Any
-    line_first: Any
-
-
 class _Owned(NamedTuple):
     """Gradients that a task may add to.
 
+    What falls on a row of another task, which sees the sample too, goes to an array that nobody reads.
+
     Args:
         plane: gradient of the plane.
-        lower, upper, line: arrays as of `_Target`.
-        owns_lower, owns_upper: whether the row below and the row above the samples at hand are the task's own.
+        lower, upper: array for the row below and the row above the samples at hand.
+        line: array for the line.
+        owns_lower, owns_upper: whether these rows are the task's own.
         line_first: element at which the task's copy of the line begins.
         waste_first: the task's part of the array that nobody reads.
     """
@@ -70,36 +58,40 @@ class _Owned(NamedTuple):
 
 
 @inline
-def _target(owned: Any, cell: Any, segment: Any) -> Any:
+def _targets(owned: Any, cell: Any, segment: Any) -> tuple[int, int, int]:
+    """Elements of lower, upper and line at which the channels of a sample begin."""
     lower = cell.first if owned.owns_lower else owned.waste_first
     upper = cell.first + cell.down if owned.owns_upper else owned.waste_first
-    line = owned.line_first + segment.first if owned.owns_lower else owned.waste_first
-    return _Target(owned.lower, lower, owned.upper, upper, owned.line, line)
+    return lower, upper, owned.line_first + segment.first if owned.owns_lower else owned.waste_first
 
 
+# Arrays come as arguments of their own: numba counts references to those in a tuple, at each sample.
 @inline
-def _add(plane: Any, line: Any, cell: Any, segment: Any, c: int, g: Any, to: Any, dtype_like: Any) -> None:
+def _add(
+    plane: Any, line: Any, cell: Any, segment: Any, c: int, g: Any, lower: Any, upper: Any, to_line: Any,
+    targets: tuple[int, int, int], dtype_like: Any,
+) -> None:  # fmt: skip
     """Add the gradient of channels from ``c`` on of a sample to four nodes of the plane and two of the line.
 
     All is read before anything is written: a processor holds a load back behind a store that agrees with it in the low
     bits of the address, and a gradient lies where its parameter does, but for these.
     """
     across, w, fraction = cell.across, cell.weights, segment.fraction
-    i, j, m = to.lower_first + c, to.upper_first + c, to.line_first + c
+    i, j, m = targets[0] + c, targets[1] + c, targets[2] + c
     on_plane = linear(line, segment, c, dtype_like) * g
     on_line = bilinear(plane, cell, c, dtype_like) * g
-    p00 = load(to.lower, i, dtype_like) + on_plane * w[0]
-    p01 = load(to.lower, i + across, dtype_like) + on_plane * w[1]
-    p10 = load(to.upper, j, dtype_like) + on_plane * w[2]
-    p11 = load(to.upper, j + across, dtype_like) + on_plane * w[3]
-    l0 = load(to.line, m, dtype_like) + on_line * (float32(1) - fraction)
-    l1 = load(to.line, m + across, dtype_like) + on_line * fraction
-    store(to.lower, i, p00)
-    store(to.lower, i + across, p01)
-    store(to.upper, j, p10)
-    store(to.upper, j + across, p11)
-    store(to.line, m, l0)
-    store(to.line, m + across, l1)
+    p00 = load(lower, i, dtype_like) + on_plane * w[0]
+    p01 = load(lower, i + across, dtype_like) + on_plane * w[1]
+    p10 = load(upper, j, dtype_like) + on_plane * w[2]
+    p11 = load(upper, j + across, dtype_like) + on_plane * w[3]
+    l0 = load(to_line, m, dtype_like) + on_line * (float32(1) - fraction)
+    l1 = load(to_line, m + across, dtype_like) + on_line * fraction
+    store(lower, i, p00)
+    store(lower, i + across, p01)
+    store(upper, j, p10)
+    store(upper, j + across, p11)
+    store(to_line, m, l0)
+    store(to_line, m + across, l1)
 
 
 @inline
@@ -110,41 +102,26 @@ def _add_entries(
     """Add the gradients of a range of listed samples to plane and line ``k``."""
     a, b, v = axes(k)
     columns, channels = plane.shape[1], plane.shape[2]
+    to_plane, lower, upper, to_line = owned.plane, owned.lower, owned.upper, owned.line
     down, far, blocks = columns * channels, ENTRY * lookahead(read), read - read % LANES
     for e in range(first, last, ENTRY):
         then = min(e + far, last - ENTRY)
         at = (int64(nodes[then + a]) * columns + int64(nodes[then + b])) * channels
         prefetch_cell(plane, at, channels, down, read)
-        prefetch_cell(owned.plane, at, channels, down, read)
+        prefetch_cell(to_plane, at, channels, down, read)
         if not summed:
             prefetch_row(upstream, (3 * int64(nodes[then + 3]) + k) * channels, read)
         at = (int64(nodes[e + a]) * columns + int64(nodes[e + b])) * channels
         cell = Cell(at, channels, down, cell_weights(fractions[e + a], fractions[e + b]))
         segment = Segment(int64(nodes[e + v]) * channels, channels, fractions[e + v])
-        to = _target(owned, cell, segment)
+        targets = _targets(owned, cell, segment)
         g, n = fractions[e + 3], (3 * int64(nodes[e + 3]) + k) * channels
         for c in range(0, blocks, LANES):
-            _add(
-                plane,
-                line,
-                cell,
-                segment,
-                c,
-                vector_zero() + g if summed else load(upstream, n + c, vector_zero()),
-                to,
-                vector_zero(),
-            )
+            gc = vector_zero() + g if summed else load(upstream, n + c, vector_zero())
+            _add(plane, line, cell, segment, c, gc, lower, upper, to_line, targets, vector_zero())
         for c in range(blocks, read):
-            _add(
-                plane,
-                line,
-                cell,
-                segment,
-                c,
-                g if summed else load(upstream, n + c, scalar_zero()),
-                to,
-                scalar_zero(),
-            )
+            gc = g if summed else load(upstream, n + c, scalar_zero())
+            _add(plane, line, cell, segment, c, gc, lower, upper, to_line, targets, scalar_zero())
 
 
 class _Grids(NamedTuple):
