@@ -98,6 +98,8 @@ class CPField(TensorialField):
 def _lines(
     resolution: tuple[int, int, int], channels: int, scale: float, generator: torch.Generator | None
 ) -> nn.ParameterList:
+    if channels < 1:
+        raise ValueError(f"components: found {channels}, expected at least 1")
     return nn.ParameterList(
         nn.Parameter(scale * torch.randn(resolution[axis], channels, generator=generator))
         for axis in LINE_AXES

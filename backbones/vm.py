@@ -131,6 +131,8 @@ def _open_components(planes: nn.ParameterList, lines: nn.ParameterList) -> int |
 def _grids(
     resolution: tuple[int, int, int], channels: int, scale: float, generator: torch.Generator | None
 ) -> tuple[nn.ParameterList, nn.ParameterList]:
+    if channels < 1:
+        raise ValueError(f"components: found {channels}, expected at least 1")
     planes, lines = nn.ParameterList(), nn.ParameterList()
     for (a, b), v in zip(PLANE_AXES, LINE_AXES, strict=True):
         planes.append(

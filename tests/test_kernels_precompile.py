@@ -83,3 +83,22 @@ def test_not_where_it_is_forbidden_or_of_no_use(monkeypatch):
     monkeypatch.setenv("GRIDREG_COMPILE_AHEAD", "1")
     monkeypatch.setattr(precompile, "usable_cores", lambda: 1)
     assert precompile.start() is None
+
+
+@pytest.mark.parametrize("kind", ["nbi", "nbc"])
+@pytest.mark.parametrize("left", [0, 40])
+def test_a_damaged_cache_is_made_anew(tmp_path, kind, left):
+    """A power failure leaves files that are empty or cut; they are replaced, which is said once."""
+    use = "from gridreg.ops.cpu import reductions; reductions._round.address"
+    quiet = {"GRIDREG_COMPILE_AHEAD": "0"}
+    before = in_fresh_cache(tmp_path, use, **quiet)
+    for file in tmp_path.glob(f"*/*.{kind}"):
+        file.write_bytes(file.read_bytes()[:left])
+    said = (
+        "import contextlib, io\nwith contextlib.redirect_stderr(io.StringIO()) as said:\n    "
+        + use.replace("; ", "\n    ")
+    )
+    told = f"{said}\nassert said.getvalue().count('damaged cache of') == 1, said.getvalue()"
+    assert in_fresh_cache(tmp_path, told, **quiet) == before
+    assert in_fresh_cache(tmp_path, told.replace("== 1", "== 0"), **quiet) == before
+    assert all(file.stat().st_size > left for file in tmp_path.glob(f"*/*.{kind}"))

@@ -7,6 +7,7 @@ import pytest
 import safetensors.torch
 import torch
 from torch import Tensor, nn
+from torchmetrics.functional.image import lpips as torchmetrics_lpips
 
 from gridreg.errors import InputError
 from gridreg.training.metrics import image_metrics
@@ -149,3 +150,33 @@ def test_wrong_arguments(alex):
         lpips(torch.zeros(40, 40, 3), torch.zeros(40, 41, 3))
     with pytest.raises(InputError, match="LPIPS needs 32 pixels each way"):
         lpips(torch.zeros(31, 40, 3), torch.zeros(31, 40, 3))
+
+
+@pytest.mark.parametrize("network", ["alex", "vgg"])
+def test_distance_is_that_of_torchmetrics(network):
+    """Its scaling, normalisation, linear layers and average, around the same convolutions with random weights."""
+    layers, weights = random_weights(network)
+    image, target = images()
+    features_of = []
+    for values in (image, target):
+        x, found = torchmetrics_lpips.ScalingLayer()(2 * values.permute(2, 0, 1)[None] - 1), []
+        for number, layer in enumerate(layers):
+            x = layer(x)
+            if number in COMPARED[network]:
+                found.append(torchmetrics_lpips._normalize_tensor(x))
+        features_of.append(found)
+    expected = 0.0
+    for level, width in enumerate(WIDTHS[network]):
+        linear = torchmetrics_lpips.NetLinLayer(width)
+        linear.model[-1].weight.data = weights[f"lin{level}.model.1.weight"]
+        difference = (features_of[0][level] - features_of[1][level]) ** 2
+        expected += torchmetrics_lpips._spatial_average(linear.eval()(difference)).item()
+    assert Lpips(weights, network)(image, target) == pytest.approx(expected, rel=1e-5)
+    assert expected > 0
+
+
+def test_the_network_is_told_by_its_weights(tmp_path, alex):
+    safetensors.torch.save_file(alex, tmp_path / "a.safetensors")
+    safetensors.torch.save_file(random_weights("vgg")[1], tmp_path / "v.safetensors")
+    assert read_lpips(tmp_path / "a.safetensors").name == "lpips_alex"
+    assert read_lpips(tmp_path / "v.safetensors").name == "lpips_vgg"

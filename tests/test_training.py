@@ -324,3 +324,20 @@ def test_nothing_to_draw_is_said_in_one_line(scene, reshuffle):
     bank.active = bank.active[:0]
     with pytest.raises(InputError, match=r"all of the \d+ pixels are transparent and see no occupied cell"):
         bank.draw(4, torch.Generator().manual_seed(0))
+
+
+@pytest.mark.parametrize(
+    ("field", "message"),
+    [
+        ({"density_components": 0}, "expected at least 1"),
+        ({"appearance_components": -1}, "expected at least 1|negative"),
+        ({"density_shift": "abc"}, r"field.density_shift: found 'abc', expected a finite number or null"),
+        ({"initial_opacity": math.inf}, "field.initial_opacity: found inf"),
+        ({"density_components": 2.5}, "field.density_components: found 2.5, expected an integer"),
+        ({"decoder": 3}, "field.decoder: found 3, expected text"),
+        ({"density_componentz": 3}, "density_componentz"),
+    ],
+)
+def test_options_of_a_field_are_checked(scene, field, message):
+    with pytest.raises(InputError, match=message):
+        build_trainer(RunConfig(field=field, train=TINY), scene)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import sys
 import time
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from gridreg.cli.arguments import Checkpoint, OptionalFolder
+from gridreg.cli.arguments import Checkpoint, OptionalFile, OptionalFolder
 
 if TYPE_CHECKING:
     from gridreg.training import LoadedRun
@@ -23,6 +24,8 @@ class EvalOptions:
     """Output folder of a run, or its checkpoint."""
     scene: OptionalFolder = None
     """Where the scene lies now; default: where the run found it."""
+    lpips: OptionalFile = None
+    """Weights of LPIPS as a safetensors file, network vgg or alex, for that distance as well; default: without it."""
     out: OptionalFolder = None
     """Folder for metrics.json, test.png and test/ (renders beside their targets); default: print the score only."""
 
@@ -31,16 +34,19 @@ def run(options: EvalOptions) -> int:
     """Print the score of each test view and their mean.
 
     Raises:
-        InputError: for a missing or damaged checkpoint, another scene, or a place that is not writable.
+        InputError: for a missing or damaged checkpoint, another scene, other weights, or a place that is not writable.
     """
     from gridreg.cli.runs import scene_of
     from gridreg.training import load_run
     from gridreg.training.config import to_data
     from gridreg.training.evaluate import Scored, score_views
     from gridreg.training.files import check_output_folder
+    from gridreg.training.metrics import image_metrics
     from gridreg.training.outputs import save_contact_sheet, save_scored
+    from gridreg.training.perceptual import read_lpips
     from gridreg.training.record import metrics_record, save_metrics, summary
 
+    lpips = None if options.lpips is None else read_lpips(options.lpips)
     loaded = load_run(options.checkpoint)
     scene = scene_of(loaded, options.checkpoint, options.scene)
     folder = None if options.out is None else check_output_folder(options.out / "test")
@@ -54,7 +60,8 @@ def run(options: EvalOptions) -> int:
         if folder is not None:
             save_scored(folder, view)
 
-    scored = score_views(loaded, scene.test, each)
+    distances = {} if lpips is None else {lpips.name: lpips}
+    scored = score_views(loaded, scene.test, each, partial(image_metrics, more=distances))
     record = metrics_record(
         {view.name: view.metrics for view in scored},
         scene=scene.name,
@@ -67,6 +74,7 @@ def run(options: EvalOptions) -> int:
         command=["gridreg", *sys.argv[1:]],
         train_views=scene.train.names,
         uses_alpha=any(run.config.train.carve for run in loaded.members or (loaded,)),
+        conventions={} if lpips is None else {lpips.name: lpips.convention},
         **_members(loaded),
     )
     if options.out is not None:

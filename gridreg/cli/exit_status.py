@@ -25,31 +25,34 @@ _OF_TRAIN = {
     "skimage",
 }
 _OF_TRAIN |= {"tqdm", "trimesh", "tyro"}
-# Line breaks that a program prints on purpose, and colours, are the only controls that reach a terminal.
-_CONTROL = re.compile(r"\x1b\[[0-9;]*m|[^\S\n\t ]|[^\w\s\x20-\x7e]")
+# Line breaks that a program prints on purpose, and colours, reach a terminal; so does what progress bars move by, on
+# standard error. Other control characters come from names in files of others.
+_CONTROL = re.compile(r"[^\S\n\t ]|[^\w\s\x20-\x7e]")
+_PASS = re.compile(r"(\x1b\[[0-9;]*m)")
+_PASS_LIVE = re.compile(r"(\x1b\[[0-9;]*[mKA]|\r)")
 
 
 class _Output:
     """Standard output or error that takes whatever is printed to it and never ends the program.
 
-    Closed, it takes text and drops it. What its encoding has not got, and on standard output whatever a terminal would
-    obey, is escaped: names come from files of others. An error of the disk behind it is kept for the end.
+    Closed, it takes text and drops it. What its encoding has not got, and whatever a terminal would obey, is escaped.
+    An error of the disk behind it is kept for the end.
 
     Args:
         stream: what stood there; None if it was closed.
-        escape: whether control characters are escaped; live lines of progress have some.
+        passing: controls that are not escaped.
     """
 
-    def __init__(self, stream: TextIO | None, *, escape: bool) -> None:
+    def __init__(self, stream: TextIO | None, passing: re.Pattern[str]) -> None:
         self.stream: TextIO = open(os.devnull, "w", encoding="utf-8") if stream is None else stream  # noqa: SIM115
-        self.escape = escape
+        self.passing = passing
         self.error: OSError | None = None
 
     def write(self, text: str) -> int:
-        if self.escape:
-            text = _CONTROL.sub(
-                lambda m: m[0] if m[0].isprintable() or m[0][-1] == "m" else one_line(m[0]), text
-            )
+        # Every second part is one that passes.
+        parts = self.passing.split(text)
+        parts[::2] = [_CONTROL.sub(lambda m: one_line(m[0]), part) for part in parts[::2]]
+        text = "".join(parts)
         encoding = getattr(self.stream, "encoding", None) or "utf-8"
         self._try(self.stream.write, text.encode(encoding, "backslashreplace").decode(encoding))
         return len(text)
@@ -80,8 +83,8 @@ def run_cli(program: Callable[[], int]) -> int:
         0
     """
     before = sys.stdout, sys.stderr
-    output = _Output(sys.stdout, escape=True)
-    sys.stdout, sys.stderr = output, _Output(sys.stderr, escape=False)  # type: ignore[assignment]
+    output = _Output(sys.stdout, _PASS)
+    sys.stdout, sys.stderr = output, _Output(sys.stderr, _PASS_LIVE)  # type: ignore[assignment]
     try:
         status = _status_of(program)
         if output.error is not None:

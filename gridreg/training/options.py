@@ -102,8 +102,9 @@ def configure(options: TrainOptions) -> RunConfig:
         config = replace(config, scene=os.path.abspath(config.scene))
     if options.steps is not None:
         if not 1 <= options.steps <= _MOST_STEPS:
+            found = options.steps if abs(options.steps) < 1 << 63 else "a longer one"
             bound = "at least 1" if options.steps < 1 else f"at most {_MOST_STEPS:,}"
-            raise InputError(f"--steps: found {options.steps:.6g}, expected {bound}")
+            raise InputError(f"--steps: found {found}, expected a number of {bound}")
         config = replace(config, train=config.train.scaled(options.steps))
     if options.threads is not None:
         if not 1 <= options.threads <= _MOST_THREADS:

@@ -184,9 +184,14 @@ class Lpips:
 
 
 def read_lpips(
-    path: str | os.PathLike[str], network: Network = "vgg", input_range: InputRange = "signed"
+    path: str | os.PathLike[str], network: Network | None = None, input_range: InputRange = "signed"
 ) -> Lpips:
     """Read the weights from a safetensors file, made as this module's page says.
+
+    Args:
+        path: the file.
+        network: whose weights they are; None: as the size of the first convolution tells.
+        input_range: as for `Lpips`.
 
     Raises:
         InputError: if the file cannot be read, is no safetensors file, or holds other weights.
@@ -198,6 +203,9 @@ def read_lpips(
     except SafetensorError as error:
         raise InputError(f"{os.fspath(path)}: not a safetensors file with LPIPS weights") from error
     try:
+        if network is None:
+            first = weights.get("net.slice1.0.weight")
+            network = "alex" if first is not None and first.shape[-1] == 11 else "vgg"
         return Lpips(weights, network, input_range)
     except InputError as error:
         raise InputError(f"{os.fspath(path)}: {error}") from error

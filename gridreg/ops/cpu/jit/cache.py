@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import hashlib
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,7 +15,7 @@ try:
 except ImportError:  # Windows has no such lock.
     fcntl = None  # type: ignore[assignment]
 
-__all__ = ["can_lock", "forget_outdated", "one_process"]
+__all__ = ["can_lock", "discard_damaged", "forget_outdated", "one_process"]
 
 
 def can_lock() -> bool:
@@ -65,3 +66,21 @@ def forget_outdated(folder: str) -> bool:
                 file.unlink(missing_ok=True)
     stamp.write_text(digest)
     return True
+
+
+def discard_damaged(folder: str, name: str) -> bool:
+    """Drop what is cached of one kernel, which could not be read; returns whether there was anything.
+
+    numba does not wait until its files are on the disk: a power failure leaves empty ones.
+    """
+    files = list(Path(folder).glob(f"{name}-*.nb?"))
+    for file in files:
+        file.unlink(missing_ok=True)
+    if files:
+        _say_damaged(folder)
+    return bool(files)
+
+
+@functools.cache
+def _say_damaged(folder: str) -> None:
+    print(f"{folder}: damaged cache of compiled kernels; they are compiled anew", file=sys.stderr)

@@ -32,7 +32,7 @@ from numba import cfunc, njit, types
 from numba.core.caching import FunctionCache
 from numba.core.errors import NumbaWarning
 
-from gridreg.ops.cpu.jit.cache import can_lock, forget_outdated, one_process
+from gridreg.ops.cpu.jit.cache import can_lock, discard_damaged, forget_outdated, one_process
 from gridreg.ops.cpu.jit.table import TABLE, cube, integer, matrix, next_task, real, vector
 
 __all__ = ["Kernel", "exact", "inline", "kernel"]
@@ -99,7 +99,13 @@ class Kernel:
                 if empty and can_lock() and self.function.__module__.startswith(_OPERATIONS):
                     _precompile()
                 with one_process(folder, self.name):
-                    return compiled(cache=True)(serving)
+                    try:
+                        return compiled(cache=True)(serving)
+                    except Exception:
+                        # Whatever reading a damaged file raises; a fault of the kernel's own is raised once more.
+                        if not discard_damaged(folder, self.name):
+                            raise
+                        return compiled(cache=True)(serving)
             except (RuntimeError, OSError):
                 # No folder to keep a cache in: neither beside the source nor in the user's.
                 return compiled(cache=False)(serving)
