@@ -14,7 +14,7 @@ from torch import Tensor, nn
 import gridreg
 from gridreg.attach.sites import SiteLike
 from gridreg.base import Context, Regularizer, overrides, register
-from gridreg.testing._subjects import anatomy, points, same
+from gridreg.testing._subjects import anatomy, points, same, samples_of
 from tests.fields import made
 
 LINE = gridreg.parameters("app_line.*", dim=1)
@@ -40,6 +40,7 @@ def test_before_the_first_call_the_step_is_0() -> None:
         assert (field.app_line[0][:, :3] != 0).any()
 
 
+@pytest.mark.filterwarnings("ignore::gridreg.attach._notices.AttachWarning")
 @given(st.lists(st.integers(0, 120), min_size=1, max_size=6))
 def test_only_the_last_step_counts(steps: list[int]) -> None:
     field, other = made("tensorf"), made("tensorf")
@@ -127,6 +128,7 @@ def test_suspending_draws_no_random_numbers() -> None:
             assert same(outputs(field), outputs(other))
 
 
+@pytest.mark.filterwarnings("ignore::gridreg.attach._notices.AttachWarning")
 @pytest.mark.parametrize("last", [0, 1])
 def test_two_handles_stack_and_come_off_in_any_order(last: int) -> None:
     field = made("tensorf")
@@ -199,21 +201,29 @@ def test_the_table_shows_regularizer_site_channels_and_value() -> None:
         total_steps=10,
     )
     handle.step(5)
+    _ = field.app_line[0], field.app_line[2]
     assert str(handle).splitlines() == [
         "gridreg on TensorField, step 5 of 10",
-        "regularizer    site        channels  value now",
-        "-------------  ----------  --------  ---------",
-        "FrequencyMask  app_line.*  3 x 12    0.75",
-        "FixedMask      mlp.0       36        0.5",
-        "OcclusionLoss  samples     -         0.25",
+        "regularizer    site        channels  value now  acted",
+        "-------------  ----------  --------  ---------  ------------------------",
+        "FrequencyMask  app_line.*  3 x 12    0.75       not read yet: app_line.1",
+        "FixedMask      mlp.0       36        0.5        not read yet",
+        "OcclusionLoss  samples     -         0.25       not asked yet",
     ]
+    assert repr(handle) == "Handle(3 regularizers on TensorField, step 5 of 10)"
+    handle.loss(samples_of(field))
+    assert [line.split()[-1] for line in str(handle).splitlines()[3:]] == ["yes", "yes", "yes"]
+    html = handle._repr_html_()
+    assert html.startswith("<table><caption>gridreg on TensorField, step 5 of 10</caption>")
+    assert "<td>FixedMask</td><td>mlp.0</td><td>36</td><td>0.5</td><td>yes</td>" in html
     assert handle.values() == {
         "FrequencyMask(app_line.*)": 0.75,
         "FixedMask(mlp.0)": 0.5,
         "OcclusionLoss": 0.25,
     }
     handle.remove()
-    assert str(handle) == "Handle(removed)"
+    assert str(handle) == repr(handle) == "Handle(removed)"
+    assert "removed" in handle._repr_html_()
 
 
 # --- bad input ---------------------------------------------------------------------------------

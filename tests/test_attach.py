@@ -129,6 +129,7 @@ def test_the_next_step_may_come_before_the_backward_pass() -> None:
         assert torch.equal(field._parameters["own"].grad != 0, expected)  # type: ignore[union-attr]
 
 
+@pytest.mark.filterwarnings("ignore::gridreg.attach._notices.AttachWarning")
 def test_open_channels_tells_what_a_field_need_not_read() -> None:
     field = made()
     assert gridreg.open_channels(field, "own") is None

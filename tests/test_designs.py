@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 import gridreg
 from gridreg.attach._hooks import slots_of
+from gridreg.attach._notices import AttachWarning
 from gridreg.attach._resolve import find, raw_tensor
 from gridreg.testing._subjects import anatomy, points, same
 from tests.fields import DESIGNS, made
@@ -144,7 +145,10 @@ def test_growing_while_attached_is_noticed_at_the_next_step() -> None:
     field.upsample_volume_grid()  # without suspended(): the mask was burnt into the copy
     assert field.density_line is not lists
     assert gridreg.open_channels(field.density_line, "0") is None
-    handle.step(0)
+    with pytest.warns(
+        AttachWarning, match=r"density_line\.0 \(FrequencyMask.*replaced outside handle\.suspended"
+    ):
+        handle.step(0)
     assert gridreg.open_channels(field.density_line, "0") == 3
     handle.remove()
 

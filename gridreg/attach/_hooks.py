@@ -1,4 +1,4 @@
-"""Attaching transforms to the tensors of a module that is not ours, and taking them off without a trace.
+"""Transforms attached to the tensors of a module that is not ours, and taken off without a trace.
 
 A parameter (or buffer) is attached to by a property on a subclass of the module's own class, made for this
 one instance. The property reads what `_parameters` holds and transforms it; so names, `state_dict`,
@@ -9,75 +9,22 @@ and pickles of the module carry it along.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import copy
+from collections.abc import Iterator, Mapping, MutableMapping
+from functools import cache
 from typing import Any
+from weakref import WeakSet
 
 import torch
 from torch import Tensor, nn
+from torch.nn.modules.module import register_module_parameter_registration_hook
+from torch.optim.optimizer import register_optimizer_step_pre_hook
 
 from gridreg.attach._instance_class import STACKS, set_instance_class
-from gridreg.attach._resolve import Match
-from gridreg.base import Context, Regularizer
+from gridreg.attach._slots import MADE, Slot, Stack, masked_parameter
 from gridreg.errors import InputError
 
-__all__ = ["Slot", "attach", "detach", "open_channels", "strip"]
-
-
-class Slot:
-    """One regularizer at one tensor: what is attached, and whether it does anything at this step.
-
-    Attributes:
-        owner: token of the handle that it belongs to.
-        active: False while the transform is the identity and is skipped.
-        closed: a byte for each channel of the tensor, 1 where it is exactly 0; None if that is not known.
-    """
-
-    def __init__(self, owner: str, regularizer: Regularizer, context: Context) -> None:
-        self.owner = owner
-        self.regularizer = regularizer
-        self.context = context
-        self.train_only = type(regularizer).train_only
-        self.active = True
-        self.closed: bytes | None = None
-
-    def refresh(self, prepare: bool = True) -> None:
-        """Bring the slot up to the context's step, if its channels are known yet."""
-        place = self.context.place
-        if place is None or place.size is None:
-            return
-        if prepare and not self.active and self.regularizer.is_over(self.context):
-            self.context.prepared_at = self.context.step
-            return
-        if prepare:
-            # A state made in inference mode could not be updated outside it.
-            with torch.inference_mode(False):
-                self.regularizer.prepare(self.context)
-            self.context.prepared_at = self.context.step
-        self.active = not self.regularizer.is_identity(self.context)
-        closed = self.regularizer.closed_channels(self.context) if self.active else None
-        self.closed = None if closed is None else closed.cpu().numpy().tobytes()
-
-    def __call__(self, value: Tensor, training: bool) -> Tensor:
-        """The transformed tensor, or `value` itself."""
-        if not self.active or (self.train_only and not training):
-            return value
-        return self.regularizer.transform(value, self.context)
-
-    def check(self, value: Tensor) -> None:
-        """Learn the number of channels at the first call, and follow it if it changes."""
-        place = self.context.place
-        if place is None:
-            return
-        if not -value.ndim <= place.dim < value.ndim:
-            raise InputError(
-                f"dim={place.dim} of {place.selector}: {place.name} has shape {tuple(value.shape)}"
-            )
-        size = value.shape[place.dim]
-        if place.size != size:
-            # A state that was loaded before the first call is not to be drawn anew.
-            fresh = place.size is not None or self.context.prepared_at != self.context.step
-            place.complete(size)
-            self.refresh(prepare=fresh)
+__all__ = ["attach", "detach", "open_channels", "slots_of", "strip"]
 
 
 class OutputHook:
@@ -120,7 +67,7 @@ def _changed(slot: Slot, module: nn.Module, value: Any, item: int | str | None) 
         tensor = None
     if not isinstance(tensor, Tensor):
         name = "a module" if place is None else f"{place.kind}({place.name!r})"
-        found = sorted(value) if isinstance(value, dict) else type(value).__name__
+        found = sorted(value) if isinstance(value, Mapping) else type(value).__name__
         raise InputError(
             f"{name}: no tensor at item={item!r} of {found}; say with item=... which one to take"
         )
@@ -130,34 +77,60 @@ def _changed(slot: Slot, module: nn.Module, value: Any, item: int | str | None) 
         return None
     if isinstance(value, Tensor):
         return result
-    if isinstance(value, dict):
-        return {**value, item: result}
-    items = [result if i == item else other for i, other in enumerate(value)]
+    if isinstance(value, MutableMapping):
+        changed = copy.copy(value)
+        changed[item] = result
+        return changed
+    # From the end as well: item=-1 is the last one.
+    items = list(value)
+    items[item] = result  # type: ignore[index]
     return type(value)(*items) if hasattr(value, "_fields") else type(value)(items)
 
 
-def attach(match: Match, slot: Slot) -> None:
-    """Let `slot` transform the tensor of a match from now on, after whatever is attached there already."""
-    if match.place.kind == "outputs":
-        match.module.register_forward_hook(OutputHook(slot, match.place.selector.item))
-    elif match.place.kind == "inputs":
-        match.module.register_forward_pre_hook(InputHook(slot, match.place.selector.item), with_kwargs=True)
+def attach(module: nn.Module, attribute: str, slot: Slot) -> None:
+    """Let `slot` transform a parameter of this name, or what a module takes or returns, after what is there already.
+
+    Raises:
+        InputError: the module is of a class that cannot be extended.
+    """
+    place = slot.context.place
+    assert place is not None
+    if isinstance(module, torch.jit.ScriptModule):
+        raise InputError(
+            f"{place.name}: belongs to a TorchScript module, whose reads nobody sees; "
+            "attach to a module around it, or script a field without regularizers"
+        )
+    if place.kind == "outputs":
+        module.register_forward_hook(OutputHook(slot, place.selector.item))
+    elif place.kind == "inputs":
+        module.register_forward_pre_hook(InputHook(slot, place.selector.item), with_kwargs=True)
     else:
-        stacks = match.module.__dict__.setdefault(STACKS, {})
-        stacks.setdefault(match.attribute, []).append(slot)
-    _update_class(match.module)
+        _watch_torch()
+        stacks = module.__dict__.setdefault(STACKS, {})
+        stacks[attribute] = Stack((*stacks.get(attribute, ()), slot))
+    try:
+        _update_class(module)
+    except TypeError as error:
+        raise InputError(f"{place.name}: cannot attach to a {type(module).__name__}: {error}") from error
 
 
-def detach(module: nn.Module, owner: str | None) -> None:
-    """Take the slots of one owner (None: of all) off a module; with the last one its class is the original
-    again."""
-    stacks: dict[str, list[Slot]] | None = module.__dict__.get(STACKS)
+def detach(module: nn.Module, owner: str | None) -> list[tuple[nn.Module, str, Slot]]:
+    """Take the slots of one owner (None: of all) off a module, whose class is the original again with the last one.
+
+    Returns:
+        The arguments of `attach` that put each back.
+    """
+    taken: list[tuple[nn.Module, str, Slot]] = []
+    stacks: dict[str, Stack] | None = module.__dict__.get(STACKS)
     if stacks is not None:
-        for attribute, slots in list(stacks.items()):
-            # A new list, so that a compiled graph or a copy that holds the old one does not change
-            # underneath.
-            stacks[attribute] = [slot for slot in slots if owner is not None and slot.owner != owner]
-            if not stacks[attribute]:
+        for attribute, stack in list(stacks.items()):
+            stack.forget()
+            gone = [slot for slot in stack if owner in (None, slot.owner)]
+            taken += [(module, attribute, slot) for slot in gone]
+            # A new stack, so that a compiled graph or a copy that holds the old one does not change underneath.
+            rest = tuple(slot for slot in stack if slot not in gone)
+            stacks[attribute] = Stack(rest)
+            if not rest:
                 del stacks[attribute]
         if not stacks:
             del module.__dict__[STACKS]
@@ -167,15 +140,56 @@ def detach(module: nn.Module, owner: str | None) -> None:
     ):
         for key, hook in list(hooks.items()):
             if isinstance(hook, (OutputHook, InputHook)) and owner in (None, hook.slot.owner):
+                taken.append((module, "", hook.slot))
                 del hooks[key]
                 extra.pop(key, None)
     _update_class(module)
+    return taken
 
 
 def _update_class(module: nn.Module) -> None:
     """Give a module the class for what is attached to it now."""
     attached = next(slots_of(module), None) is not None
     set_instance_class(module, tuple(sorted(module.__dict__.get(STACKS, ()))) if attached else None)
+
+
+@cache
+def _watch_torch() -> None:
+    """From the first masked parameter on, see where torch is handed a masked tensor in the place of a parameter."""
+    register_module_parameter_registration_hook(_parameter_registered)  # type: ignore[arg-type]
+    register_optimizer_step_pre_hook(_optimizer_steps)
+
+
+def _parameter_registered(module: nn.Module, name: str, parameter: Tensor | None) -> Tensor | None:
+    """A parameter made of a masked tensor becomes the raw parameter, read through the same stack.
+
+    Slices and copies of a `ParameterList` or `ParameterDict` make such parameters in the middle of a forward pass:
+    torch would cut their gradient off.
+    """
+    if parameter is None or parameter.is_meta or not parameter.numel():
+        return None
+    for stack in tuple(MADE):
+        made = stack.made
+        if made is not None and parameter.data_ptr() == made.data_ptr() and parameter.shape == made.shape:
+            module.__dict__.setdefault(STACKS, {})[name] = stack
+            _update_class(module)
+            return masked_parameter(made)
+    return None
+
+
+_CHECKED: WeakSet[torch.optim.Optimizer] = WeakSet()
+
+
+def _optimizer_steps(optimizer: torch.optim.Optimizer, arguments: Any, keywords: Any) -> None:
+    """Refuse, at its first step, an optimizer that was given masked tensors, which it would change in vain."""
+    if optimizer in _CHECKED:
+        return
+    if any(masked_parameter(p) is not None for group in optimizer.param_groups for p in group["params"]):
+        raise InputError(
+            "optimizer: it holds masked tensors, not parameters; make it of handle.parameter_groups(groups), "
+            "of field.parameters(), or inside handle.suspended()"
+        )
+    _CHECKED.add(optimizer)
 
 
 def strip(module: nn.Module) -> None:
@@ -186,8 +200,8 @@ def strip(module: nn.Module) -> None:
 
 def slots_of(module: nn.Module) -> Iterator[Slot]:
     """All slots on one module, for inspection."""
-    for slots in module.__dict__.get(STACKS, {}).values():
-        yield from slots
+    for stack in module.__dict__.get(STACKS, {}).values():
+        yield from stack
     for hook in (*module._forward_hooks.values(), *module._forward_pre_hooks.values()):
         if isinstance(hook, (OutputHook, InputHook)):
             yield hook.slot
@@ -213,7 +227,11 @@ def open_channels(module: nn.Module, name: str, channels: slice | None = None) -
     stacks = module.__dict__.get(STACKS)
     if stacks is None:
         return None
-    closed = [slot.closed for slot in stacks.get(name, ()) if slot.active and slot.closed is not None]
+    closed = []
+    for slot in stacks.get(name, ()):
+        slot.read = True
+        if slot.active and slot.closed is not None:
+            closed.append(slot.closed)
     if not closed:
         return None
     together = closed[0] if len(closed) == 1 else bytes(map(max, *closed))

@@ -2,23 +2,39 @@
 
 from __future__ import annotations
 
-import types
+import sys
 from collections.abc import Callable
 from typing import Any, cast
 from weakref import WeakValueDictionary
 
-from torch import nn
+import torch
+from torch import Tensor, nn
+from torch.nn.utils import parametrize, prune
 
 __all__ = ["STACKS", "set_instance_class"]
 
 STACKS = "_gridreg_stacks"
-"""Entry of a module's `__dict__`: for each tensor, the slots that act on it, in order."""
+"""Entry of a module's `__dict__`: for each tensor, the stack of slots that acts on it."""
 
 _BASE = "_gridreg_base"
 _NAMES = "_gridreg_names"
 
 _CLASSES: WeakValueDictionary[tuple[type[nn.Module], tuple[str, ...]], type[nn.Module]] = (
     WeakValueDictionary()
+)
+
+# torch reads attributes in some places where it means parameters: `get_parameter` would refuse a masked tensor,
+# and `register_parametrization` would store it for good. These callers get the parameter. The reading frame is
+# all that tells them apart, and it reaches every module above the attached one, which a method could not
+# (test_torch_gets_parameters_where_it_means_them).
+_RAW_READERS = frozenset(
+    function.__code__
+    for function in (
+        nn.Module.get_parameter,
+        nn.Module.get_buffer,
+        parametrize.register_parametrization,
+        cast(Any, prune.BasePruningMethod.apply).__func__,
+    )
 )
 
 
@@ -30,7 +46,10 @@ def set_instance_class(module: nn.Module, names: tuple[str, ...] | None) -> None
     """
     cls = type(module)
     base: type[nn.Module] = cls.__dict__.get(_BASE, cls)
-    module.__class__ = base if names is None else _instance_class(base, names)
+    wanted = base if names is None else _instance_class(base, names)
+    if wanted is not cls:
+        # Past a `__setattr__` of the class's own, which may refuse.
+        object.__setattr__(module, "__class__", wanted)
 
 
 def _instance_class(base: type[nn.Module], names: tuple[str, ...]) -> type[nn.Module]:
@@ -46,11 +65,22 @@ def _instance_class(base: type[nn.Module], names: tuple[str, ...]) -> type[nn.Mo
             "__qualname__": base.__qualname__,
             "__doc__": base.__doc__,
         }
-        cls = types.new_class(
-            base.__name__, (base,), {"metaclass": type(base)}, lambda body: body.update(members)
-        )
+        cls = type.__new__(type(base), base.__name__, (_shield(base), base), members)
         _CLASSES[base, names] = cls
     return cls
+
+
+def _shield(base: type) -> type:
+    """A class that keeps `__init_subclass__` of a user's class, which may register or count, from what comes after it.
+
+    It has the bases of the class that gave `base` its `__dict__`, so that Python allows to assign `__class__`. That it
+    is made by `type` itself keeps a metaclass from registering it.
+    """
+    root = base
+    while "__dict__" not in vars(root):
+        root = cast(type, root.__base__)
+    nothing = classmethod(lambda cls, **arguments: None)
+    return type.__new__(type(root), base.__name__, root.__bases__, {"__init_subclass__": nothing})
 
 
 def _property(name: str) -> property:
@@ -62,13 +92,26 @@ def _property(name: str) -> property:
         if value is None:
             value = own["_buffers"].get(name)
         if value is None:
+            # Where DataParallel keeps the tensors of its replicas, and whoever replaced a parameter by a tensor.
+            value = own.get(name)
+        if value is None:
             # The name was deleted or holds None, which is how torch itself finds it then.
             return nn.Module.__getattr__(self, name)
-        for slot in own.get(STACKS, {}).get(name, ()):
-            value = slot(value, self.training)
-        return value
+        stack = own.get(STACKS, {}).get(name)
+        if stack is None or not isinstance(value, Tensor):
+            return value
+        if not torch.compiler.is_compiling() and sys._getframe(1).f_code in _RAW_READERS:
+            return value
+        return stack(value, self.training)
 
-    return property(get)
+    def put(self: nn.Module, value: Any) -> None:
+        self.__dict__[name] = value
+
+    def delete(self: nn.Module) -> None:
+        if self.__dict__.pop(name, self) is self:
+            raise AttributeError(name)
+
+    return property(get, put, delete)
 
 
 def _reduce_ex(self: nn.Module, protocol: Any) -> Any:
@@ -92,5 +135,5 @@ def _rebuild(
 ) -> nn.Module:
     """The empty module, with its properties; its state follows."""
     module = function(*arguments)
-    module.__class__ = _instance_class(base, names)
+    set_instance_class(module, names)
     return module

@@ -103,6 +103,16 @@ def sites_of(field: nn.Module) -> dict[str, Site]:
     return {name: _prefixed(site, prefix) for name, site in sites.items()}
 
 
+def _declared_below(field: nn.Module) -> dict[str, Site]:
+    """Sites that the parts of a field declare, each by its path: "field.density"."""
+    return {
+        f"{path}.{name}": _prefixed(site, path)
+        for path, module in field.named_modules(remove_duplicate=False)
+        if path
+        for name, site in _declared_by(module).items()
+    }
+
+
 def _prefixed(site: Site, prefix: str) -> Site:
     """The same site seen from a module further out."""
 
@@ -125,23 +135,28 @@ def find(field: nn.Module, site: SiteLike, part: Literal["mask", "grids"]) -> li
     """
     if isinstance(site, str):
         declared = sites_of(field)
-        if site not in declared:
+        by_path = declared if site in declared else _declared_below(field)
+        if site not in by_path:
+            names = [*declared, *by_path]
             raise InputError(
-                _unknown(site, list(declared), f"{type(field).__name__} declares no site of this name")
+                _unknown(site, names, f"{type(field).__name__} declares no site of this name", _SITES)
             )
-        site = declared[site]
+        site = by_path[site]
     if isinstance(site, Selector):
         site = Site((site,))
     return [match for selector in site.selectors(part) for match in _find_selector(field, selector)]
 
 
-def _unknown(name: str, names: Sequence[str], reason: str) -> str:
-    """One line: what was asked, the near names, all names."""
-    text = f"site {name!r}: {reason}{near_names(name, names, 3)}"
+_SITES = "nor does any part of it; name tensors with gridreg.parameters, outputs or inputs"
+
+
+def _unknown(name: str, names: Sequence[str], reason: str, none: str = "there are none here") -> str:
+    """One line: what was asked, the near names, all names; `none` is said where there are no names."""
+    ends = [n for n in names if n.endswith(f".{name}")]
+    near = f"; did you mean {' or '.join(map(repr, ends[:3]))}?" if ends else near_names(name, names, 3)
     shown = ", ".join(repr(n) for n in names[:20]) + (", ..." if len(names) > 20 else "")
-    return text + (
-        f" Names: {shown}" if names else " There are none; use gridreg.parameters, outputs or inputs"
-    )
+    listed = f"{near or '.'} Names: {shown}" if names else f"; {none}"
+    return f"site {name!r}: {reason}{listed}"
 
 
 def _matching(pattern: str, names: Iterable[str]) -> list[str]:

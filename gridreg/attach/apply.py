@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from torch import nn
 
-from gridreg.attach._binding import Attachment
+from gridreg.attach._attachment import Attachment
 from gridreg.attach._resolve import sites_of
 from gridreg.attach.handle import Handle
 from gridreg.base import Clock, Regularizer

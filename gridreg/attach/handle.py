@@ -3,42 +3,33 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
-from weakref import WeakKeyDictionary, ref
 
-import torch
 from torch import Tensor, nn
 
-from gridreg.attach._binding import Attachment, Binding
-from gridreg.attach._table import table
-from gridreg.base import LocalTerm, Regularizer
+from gridreg.attach._binding import Binding
+from gridreg.attach._parts import HandleParts
+from gridreg.attach._table import html_table, table
+from gridreg.base import Regularizer
 from gridreg.errors import InputError
 
 if TYPE_CHECKING:
-    from gridreg.samples import RaySamples
+    pass
 
 __all__ = ["Handle"]
 
-# Weak both ways: a handle holds its field, so a strong handle here would keep the field alive for ever.
-_HANDLES: WeakKeyDictionary[nn.Module, list[ref[Handle]]] = WeakKeyDictionary()
 
+class Handle(HandleParts):
+    """Sets the step, gives the loss, and takes everything off again; returned by `apply`.
 
-class Handle:
-    """What `apply` returns: sets the step, gives the loss, and takes everything off again.
+    Keep it: when it is dropped, everything comes off the field.
 
     Attributes:
         terms: weighted, detached parts of the last `loss`, by name; they sum to its value.
     """
-
-    def __init__(self, attachment: Attachment) -> None:
-        self.terms: dict[str, Tensor] = {}
-        self._attachment = attachment
-        self._removed = False
-        _HANDLES.setdefault(attachment.field, []).append(ref(self))
 
     @property
     def regularizers(self) -> tuple[Regularizer, ...]:
@@ -67,117 +58,77 @@ class Handle:
         self._attachment.clock.step = int(step)
         self._attachment.refresh()
 
-    # --- losses ----------------------------------------------------------------------------------
-
-    def loss(self, samples: RaySamples | None = None, *, exclude: Collection[str] = ()) -> Tensor:
-        """Weighted sum of all penalties, differentiable; 0 if nothing contributes.
-
-        Args:
-            samples: of the batch; may be left out if no penalty reads them.
-            exclude: names of penalties to leave out, see `grid_terms`.
-
-        Raises:
-            InputError: a penalty needs samples, or an attribute of them, that are not there.
-        """
-        bindings = self._bindings(Regularizer.penalty, Regularizer.grid_penalty)
-        names = [binding.name for binding in bindings]
-        unknown = sorted(set(exclude) - set(names))
-        if unknown:
-            raise InputError(f"exclude={unknown}: expected names of penalties, which are {names}")
-        self._attachment.sync()
-        self.terms = {}
-        total = _zero(self._attachment.field, samples)
-        for binding in bindings:
-            if binding.name not in exclude:
-                part = self._penalty(binding, samples)
-                self.terms[binding.name] = part.detach()
-                total = total + part
-        return total
-
-    def _penalty(self, binding: Binding, samples: RaySamples | None) -> Tensor:
-        """Weighted penalty of one regularizer; at weight 0 it is not computed."""
-        weight = _weight(binding)
-        total = _zero(self._attachment.field, samples)
-        if weight != 0 and binding.overrides(Regularizer.penalty):
-            if samples is None:
-                raise InputError(f"{binding.name}: needs samples; call handle.loss(samples)")
-            for attribute in binding.regularizer.needs():
-                if getattr(samples, attribute, None) is None:
-                    raise InputError(
-                        f"{binding.name}: needs samples.{attribute}, found None; "
-                        "use a renderer that fills it in, or drop the regularizer"
-                    )
-            total = total + weight * binding.regularizer.penalty(samples, binding.context)
-        if weight != 0 and binding.overrides(Regularizer.grid_penalty):
-            total = total + weight * binding.regularizer.grid_penalty(binding.grids, binding.context)
-        return total
-
-    def grid_terms(self) -> list[LocalTerm]:
-        """Penalties on grids that have a closed form, with their weights now, for a fused optimizer step.
-
-        Pass the names of those that the optimizer took over to `loss(samples, exclude=names)`.
-        """
-        bindings = self._bindings(Regularizer.local_terms)
-        self._attachment.sync()
-        terms = []
-        for binding in bindings:
-            weight = _weight(binding)
-            if weight != 0:
-                for term in binding.regularizer.local_terms(binding.grids, binding.context):
-                    terms.append(replace(term, name=binding.name, scale=term.scale * weight))
-        return terms
-
-    # --- hooks for a renderer and a trainer; each is a no-op if no regularizer plays the part ----
-
-    def on_samples(self, samples: RaySamples) -> RaySamples:
-        """The samples as compositing and losses are to see them."""
-        for binding in self._bindings():
-            samples = binding.regularizer.on_samples(samples, binding.context)
-        return samples
-
-    def background(
-        self, count: int, generator: torch.Generator, default: Tensor | None = None
-    ) -> Tensor | None:
-        """Background colours `(count, 3)` behind training rays and their targets, or the default."""
-        for binding in self._bindings():
-            default = binding.regularizer.background(count, generator, default, binding.context)
-        return default
-
-    def near_far(self, near: Tensor, far: Tensor) -> tuple[Tensor, Tensor]:
-        """Interval of the training rays, world units, shapes `(R,)`."""
-        for binding in self._bindings():
-            near, far = binding.regularizer.near_far(near, far, binding.context)
-        return near, far
-
-    def parameter_groups(self, groups: list[dict[str, Any]]) -> list[dict[str, Any]]:
-        """Parameter groups for an optimizer, split or changed; ask whenever one is made."""
-        for binding in self._bindings():
-            groups = binding.regularizer.parameter_groups(groups, binding.grids, binding.context)
-        return groups
-
-    def update_groups(self, groups: list[dict[str, Any]]) -> None:
-        """Update what schedules drive in an optimizer's `param_groups`, in place; ask at each step."""
-        for binding in self._bindings():
-            binding.regularizer.update_groups(groups, binding.grids, binding.context)
-
     # --- suspending and removing -----------------------------------------------------------------
 
     @contextmanager
     def suspended(self) -> Iterator[Handle]:
-        """The field as if nothing were attached, by this handle or another: for surgery such as resampling.
+        """The field as if nothing were attached, by this handle or any other: for surgery such as resampling.
 
-        Parameters, lists and submodules may be replaced; on leaving, everything is attached again, by name.
+        That holds for the field, what it holds, what holds it and what it shares modules with. Parameters, lists and
+        submodules may be replaced; on leaving, everything is attached again, by name.
+
+        Raises:
+            InputError: on leaving, a site is no longer there; what else can be attached again is.
         """
         self._require_applied()
-        handles = [handle for reference in _HANDLES[self._attachment.field] if (handle := reference())]
-        for handle in handles:
-            handle._attachment.suspend()
+        with self._attachment.suspended():
+            yield self
+
+    def suspends(self, method: str) -> Handle:
+        """Run a method of the field that somebody else calls inside `suspended`, from now on until `remove`.
+
+        Args:
+            method: dotted path from the field, such as "encoder.upsample_grid" (TensoRF's `upsample_volume_grid`,
+                a callback of nerfstudio). Whoever keeps the bound method must fetch it after this call.
+
+        Returns:
+            The handle itself.
+
+        Raises:
+            InputError: there is no such method; near names are listed.
+        """
+        self._require_applied()
+        self._attachment.suspends(method)
+        return self
+
+    @contextmanager
+    def cached(self) -> Iterator[Handle]:
+        """Inside, reads without gradients compute no transform twice: for rendering many chunks of an image.
+
+        Reads with gradients never do: a parameter is transformed once between two steps or backward passes.
+        """
+        self._require_applied()
+        stacks = self._attachment.stacks()
+        for stack in stacks:
+            stack.forget()
+            stack.keep += 1
         try:
             yield self
         finally:
-            for handle in handles:
-                if not handle._removed:
-                    handle._attachment.resume()
+            for stack in stacks:
+                stack.keep -= 1
+                stack.forget()
+
+    def follow(self, copy: nn.Module) -> Handle:
+        """Let a copy of the field (an `AveragedModel`, an EMA) have the masks of each step, as the field has them.
+
+        Raises:
+            InputError: the copy lacks a site of the field, or has other channels there.
+        """
+        self._require_applied()
+        self._attachment.follow(copy)
+        return self
+
+    def bake(self) -> None:
+        """Write what the field reads in eval mode into its parameters, then remove the handle.
+
+        For export, and at the end of a run whose masks are not fully open: outputs stay bit for bit as they are.
+
+        Raises:
+            InputError: an output or input of a module is transformed, which no parameter can hold.
+        """
+        self._require_applied()
+        self._attachment.bake()
 
     def remove(self) -> None:
         """Take everything off: the field is what it would be without.
@@ -186,9 +137,7 @@ class Handle:
             InputError: removed before.
         """
         self._require_applied()
-        self._attachment.detach()
-        self._removed = True
-        _HANDLES[self._attachment.field].remove(ref(self))
+        self._attachment.remove()
 
     def __enter__(self) -> Handle:
         self._require_applied()
@@ -197,7 +146,7 @@ class Handle:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if not self._removed:
+        if not self._attachment.removed:
             self.remove()
 
     # --- saving and telling ----------------------------------------------------------------------
@@ -235,7 +184,7 @@ class Handle:
         self._attachment.clock.generator.set_state(state["generator"])
 
     def values(self) -> dict[str, float]:
-        """One number per regularizer for curves: the open share of a mask, the weight of a penalty."""
+        """One number per regularizer for curves: the open fraction of a mask, the weight of a penalty."""
         return {binding.name: binding.value() for binding in self._bindings()}
 
     def masks(self) -> dict[str, Tensor]:
@@ -249,49 +198,37 @@ class Handle:
         return found
 
     def __repr__(self) -> str:
-        """A table: regularizer, site, channels, value now."""
-        if self._removed:
+        attachment = self._attachment
+        if attachment.removed:
             return "Handle(removed)"
+        return f"Handle({len(attachment.bindings)} regularizers on {self._title})"
+
+    def __str__(self) -> str:
+        """A table: regularizer, site, channels, value now, and whether it has acted yet."""
+        if self._attachment.removed:
+            return repr(self)
+        return f"gridreg on {self._title}\n{table(_HEAD, map(_cells, self._bindings()))}"
+
+    def _repr_html_(self) -> str:
+        """The table as notebooks show it."""
+        if self._attachment.removed:
+            return html_table(repr(self), (), ())
+        return html_table(f"gridreg on {self._title}", _HEAD, map(_cells, self._bindings()))
+
+    @property
+    def _title(self) -> str:
         clock = self._attachment.clock
-        title = (
-            f"gridreg on {type(self._attachment.field).__name__}, step {clock.step} of {clock.total_steps}"
-        )
-        return (
-            title
-            + "\n"
-            + table(("regularizer", "site", "channels", "value now"), map(_cells, self._bindings()))
-        )
-
-    def _bindings(self, *methods: Callable[..., object]) -> list[Binding]:
-        """Rows whose regularizers override one of these methods, all without any."""
-        self._require_applied()
-        return [
-            binding for binding in self._attachment.bindings if not methods or binding.overrides(*methods)
-        ]
-
-    def _require_applied(self) -> None:
-        if self._removed:
-            raise InputError("handle: it was removed; call gridreg.apply again for a new one")
+        return f"{type(self._attachment.field).__name__}, step {clock.step} of {clock.total_steps}"
 
 
-def _weight(binding: Binding) -> float:
-    """The weight of a penalty now."""
-    try:
-        return binding.context.at(getattr(binding.regularizer, "weight", 1.0), "weight", low=0.0)
-    except InputError as error:
-        raise InputError(f"{binding.name}: {error}") from None
+_HEAD = ("regularizer", "site", "channels", "value now", "acted")
 
 
-def _zero(field: nn.Module, samples: RaySamples | None) -> Tensor:
-    """The scalar 0 where the field computes."""
-    first = next(field.parameters(), None) if samples is None else samples.density
-    return torch.zeros((), device=None if first is None else first.device)
-
-
-def _cells(binding: Binding) -> tuple[str, str, str, str]:
+def _cells(binding: Binding) -> tuple[str, ...]:
     """A regularizer's line in the table."""
     sizes = [match.place.channels for match, _ in binding.slots]
     counts = sorted({"?" if size is None else str(size) for size in sizes})
     channels = (f"{len(sizes)} x " if len(sizes) > 1 else "") + ", ".join(counts)
     value = "?" if math.isnan(binding.value()) else f"{binding.value():.4g}"
-    return type(binding.regularizer).__name__, binding.label or "samples", channels or "-", value
+    name = type(binding.regularizer).__name__
+    return name, binding.label or "samples", channels or "-", value, binding.idle or "yes"

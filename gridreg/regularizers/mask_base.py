@@ -7,7 +7,7 @@ from functools import lru_cache
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from gridreg.attach.sites import Place, SiteLike
 from gridreg.base import Context, Regularizer
@@ -101,17 +101,29 @@ class Mask(Regularizer):
 
 
 class _ScaledGradient(torch.autograd.Function):
-    """The identity, with its gradient multiplied by a mask."""
+    """The identity, with its gradient multiplied by a mask; under torch.func's transforms too."""
+
+    generate_vmap_rule = True
 
     @staticmethod
-    def forward(ctx: Any, value: Tensor, mask: Tensor) -> Tensor:
-        ctx.save_for_backward(mask)
-        return value.view_as(value)
+    def forward(value: Tensor, mask: Tensor) -> Tensor:
+        # No view: a network may write into it in place (nn.ReLU(inplace=True)).
+        return value.clone()
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
+        ctx.save_for_backward(inputs[1])
+        ctx.save_for_forward(inputs[1])
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
         (mask,) = ctx.saved_tensors
         return torch.where(mask > 0, gradient * mask, 0.0), None
+
+    @staticmethod
+    def jvp(ctx: Any, tangent: Tensor, _: None) -> Tensor:
+        (mask,) = ctx.saved_tensors
+        return torch.where(mask > 0, tangent * mask, 0.0)
 
 
 @lru_cache(maxsize=256)
@@ -142,7 +154,10 @@ def broadcast(context: Context, name: str, value: Tensor) -> Tensor:
     """Factors from the state, shaped to multiply `value` along the channel axis of the context's place."""
     factors = context.state[name]
     if factors.device != value.device:
-        factors = context.state[name] = factors.to(value.device)
+        factors = factors.to(value.device)
+        if not value.is_meta and type(value) in (Tensor, nn.Parameter):
+            # Not what a tracer made of it, nor without values on the meta device.
+            context.state[name] = factors
     dim = -1 if context.place is None else context.place.dim
     if value.shape[dim] != len(factors):
         name = "" if context.place is None else context.place.name

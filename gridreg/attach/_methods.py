@@ -1,0 +1,68 @@
+"""Methods of a field that somebody else calls, wrapped to run while nothing is attached."""
+
+from __future__ import annotations
+
+import difflib
+from typing import TYPE_CHECKING, Any
+from weakref import ref
+
+from torch import nn
+
+from gridreg.errors import InputError
+
+if TYPE_CHECKING:
+    from gridreg.attach._attachment import Attachment
+
+__all__ = ["SuspendingMethod", "wrap"]
+
+
+class SuspendingMethod:
+    """Stands in an object's `__dict__` in front of the method of its class."""
+
+    def __init__(self, attachment: Attachment, owner: Any, name: str) -> None:
+        # Weak: the field holds this, and must not keep a dropped handle alive.
+        self._attachment: ref[Attachment] | None = ref(attachment)
+        self._owner, self._name = owner, name
+        self._method = getattr(owner, name)
+        self._before = {name: owner.__dict__[name]} if name in owner.__dict__ else {}
+        owner.__dict__[name] = self
+
+    def __getstate__(self) -> dict[str, Any]:
+        """A copy of the field has the method, without a handle to suspend."""
+        return {**self.__dict__, "_attachment": None}
+
+    def __call__(self, *arguments: Any, **keywords: Any) -> Any:
+        """The method's result, computed inside `suspended`."""
+        attachment = None if self._attachment is None else self._attachment()
+        if attachment is None or attachment.removed:
+            return self._method(*arguments, **keywords)
+        with attachment.suspended():
+            return self._method(*arguments, **keywords)
+
+    def unwrap(self) -> None:
+        """Put back what was there."""
+        if self._owner.__dict__.get(self._name) is self:
+            del self._owner.__dict__[self._name]
+            self._owner.__dict__.update(self._before)
+
+
+def wrap(attachment: Attachment, field: nn.Module, path: str) -> SuspendingMethod:
+    """Put a `SuspendingMethod` in front of a method, named by its dotted path from the field.
+
+    Raises:
+        InputError: there is no such method; near names are listed.
+    """
+    owner: Any = field
+    *parents, name = path.split(".")
+    for parent in parents:
+        owner = getattr(owner, parent, None)
+    if not callable(getattr(owner, name, None)) or not hasattr(owner, "__dict__"):
+        names = [
+            ".".join([*parents, n])
+            for n in dir(owner)
+            if not n.startswith("_") and callable(getattr(type(owner), n, None))
+        ]
+        near = difflib.get_close_matches(path, names, n=3, cutoff=0.5)
+        hint = f"; did you mean {', '.join(map(repr, near))}?" if near else ""
+        raise InputError(f"suspends({path!r}): {type(field).__name__} has no such method{hint}")
+    return SuspendingMethod(attachment, owner, name)
