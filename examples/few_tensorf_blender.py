@@ -31,8 +31,8 @@ def main(options: TrainOptions) -> int:
         run, metrics = execute(config, scene, out, resume=options.resume, command=sys.argv, watch=look)
         if metrics is None:
             return 130
-        draw_run(run, mesh=options.mesh, video=options.video)
         print(f"{summary(metrics)}; trained in {metrics['seconds']['train']:.0f} s", flush=True)
+        draw_run(run, mesh=options.mesh, video=options.video)
         if look is not None:
             look.finish()
     return 0

@@ -33,8 +33,9 @@ def run(options: TrainOptions) -> int:
         )
         if metrics is None:
             return 130
+        # The score first: mesh and video take their time, and may fail.
+        print(f"{summary(metrics)}; trained in {metrics['seconds']['train']:.0f} s", flush=True)
         written = draw_run(execution, mesh=options.mesh, video=options.video)
-        print(f"{summary(metrics)}; trained in {metrics['seconds']['train']:.0f} s")
         for path in [out / "metrics.json", out / "test.png", *written]:
             print(f"  {path}")
         sys.stdout.flush()
