@@ -4,21 +4,30 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar
 
 import torch
 from torch import Tensor
 
-from gridreg.attach.selectors import abridged
-from gridreg.attach.sites import Grid, Place, Selector, Site, SiteLike
+from gridreg._checks import NOT_NEGATIVE, check_site, choices_of, within
+from gridreg.attach.sites import Grid, Place, SiteLike
 from gridreg.errors import InputError
 from gridreg.schedules import Numeric, check_numeric, end_step, resolve
 
 if TYPE_CHECKING:
     from gridreg.samples import RaySamples
 
-__all__ = ["REGISTRY", "Clock", "Context", "LocalTerm", "Regularizer", "overrides", "register"]
+__all__ = [
+    "NOT_NEGATIVE",
+    "REGISTRY",
+    "Clock",
+    "Context",
+    "LocalTerm",
+    "Regularizer",
+    "overrides",
+    "register",
+    "within",
+]
 
 
 class Clock:
@@ -118,15 +127,6 @@ class LocalTerm:
     name: str = ""
 
 
-NOT_NEGATIVE = (0.0, float("inf"))
-"""A range for `within`."""
-
-
-def within(**ranges: tuple[float, float]) -> Mapping[str, tuple[float, float]]:
-    """Lowest and highest values by the name of a field: for `Regularizer.ranges`."""
-    return ranges
-
-
 @dataclass(frozen=True)
 class Regularizer:
     """Base of all regularizers: a frozen dataclass whose fields are its configuration.
@@ -161,11 +161,11 @@ class Regularizer:
         if "site" in known and (self.site is not None or known["site"].default is not None):  # type: ignore[attr-defined]
             check_site(self.site)  # type: ignore[attr-defined]
         if "weight" in known:
-            check_weight(self.weight)  # type: ignore[attr-defined]
+            check_numeric("weight", self.weight, low=0.0)  # type: ignore[attr-defined]
         for name, (low, high) in self.ranges.items():
             if getattr(self, name) is not None:
                 check_numeric(name, getattr(self, name), low, high)
-        for name, choices in _choices(type(self)).items():  # type: ignore[arg-type]
+        for name, choices in choices_of(type(self)).items():  # type: ignore[arg-type]
             if getattr(self, name) not in choices:
                 *first, last = map(repr, choices)
                 raise InputError(f"{name}={getattr(self, name)!r}: expected {', '.join(first)} or {last}")
@@ -260,16 +260,6 @@ class Regularizer:
         return []
 
 
-@lru_cache
-def _choices(cls: type[Regularizer]) -> dict[str, tuple[str, ...]]:
-    """Fields that are one of several texts, by their annotation."""
-    try:
-        hints = get_type_hints(cls)
-    except NameError:  # Names that are imported for type checkers alone.
-        return {}
-    return {name: get_args(hint) for name, hint in hints.items() if get_origin(hint) is Literal}
-
-
 RegularizerClass = TypeVar("RegularizerClass", bound=type[Regularizer])
 
 REGISTRY: dict[str, type[Regularizer]] = {}
@@ -297,21 +287,3 @@ def overrides(regularizer: Regularizer | type[Regularizer], method: str | Callab
     cls = regularizer if isinstance(regularizer, type) else type(regularizer)
     own, default = getattr(cls, name), getattr(Regularizer, name)
     return getattr(own, "__func__", own) is not getattr(default, "__func__", default)
-
-
-def check_weight(value: object) -> None:
-    """Refuse negative, NaN or infinite weights; a schedule is checked when it is read."""
-    check_numeric("weight", value, low=0.0)
-
-
-def check_site(value: object) -> None:
-    """Refuse what is not a site.
-
-    Raises:
-        InputError: naming the value and the four ways to name a site.
-    """
-    if not isinstance(value, (str, Selector, Site)):
-        raise InputError(
-            f"site={abridged(value)}: expected the name of a declared site, or "
-            "gridreg.parameters(...), gridreg.outputs(...) or gridreg.inputs(...)"
-        )
