@@ -10,18 +10,17 @@ from itertools import count
 from typing import Any, Literal
 from weakref import WeakSet, ref
 
-import torch
 from torch import Tensor, nn
 
 from gridreg.attach import _notices
 from gridreg.attach._binding import READS_GRIDS, Binding, bindings_of, site_label
 from gridreg.attach._hooks import attach, detach
 from gridreg.attach._instance_class import STACKS
-from gridreg.attach._methods import SuspendingMethod, wrap
-from gridreg.attach._resolve import Match, find, raw_tensor
+from gridreg.attach._methods import SuspendingMethod, resume, wrap
+from gridreg.attach._resolve import Match, find
 from gridreg.attach._slots import Slot, Stack
 from gridreg.attach._snapshot import Snapshot
-from gridreg.attach._state import load_state, state_of
+from gridreg.attach._state import bake, load_state, state_of
 from gridreg.attach.sites import SiteLike
 from gridreg.base import Clock, Context, Regularizer
 from gridreg.errors import InputError
@@ -238,9 +237,9 @@ class Attachment:
         try:
             yield
         except BaseException:
-            _resume(related, orphans)
+            resume(related, orphans)
             raise
-        error = _resume(related, orphans)
+        error = resume(related, orphans)
         if error is not None:
             raise error
 
@@ -255,20 +254,7 @@ class Attachment:
 
     def bake(self) -> None:
         """Write what the field reads in eval mode into its parameters, and take everything off."""
-        for binding in self.bindings:
-            if any(slot.active and match.place.kind != "parameters" for match, slot in binding.slots):
-                raise InputError(
-                    f"{binding.name}: acts on the {binding.slots[0][0].place.kind} of a module, which no parameter "
-                    "can hold; name its columns with gridreg.parameters(...), or go on until it is fully open"
-                )
-        with torch.no_grad():
-            for binding in self.bindings:
-                done: set[int] = set()
-                for match, slot in binding.slots:
-                    raw = raw_tensor(match.module, match.attribute)
-                    if id(raw) not in done:
-                        raw.copy_(slot(raw, training=False))
-                        done.add(id(raw))
+        bake(self.bindings)
         self.remove()
 
     # --- saving ----------------------------------------------------------------------------------
@@ -307,20 +293,3 @@ class Attachment:
         self.__dict__.clear()
         if field() is not None and not replaced and not used:
             _notices.dropped(names, field())
-
-
-def _resume(
-    attachments: Sequence[Attachment], orphans: Sequence[tuple[nn.Module, str, Slot]]
-) -> Exception | None:
-    """Attach everything again; the first error is returned when all others are back."""
-    first: Exception | None = None
-    for entry in orphans:
-        attach(*entry)
-    for attachment in attachments:
-        attachment._suspensions -= 1
-        if attachment._suspensions == 0 and not attachment.removed:
-            try:
-                attachment.attach()
-            except Exception as error:
-                first = first or error
-    return first

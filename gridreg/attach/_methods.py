@@ -1,19 +1,22 @@
-"""Methods of a field that somebody else calls, wrapped to run while nothing is attached."""
+"""Methods of a field that somebody else calls, wrapped to run while nothing is attached; and what ends that."""
 
 from __future__ import annotations
 
 import difflib
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 from weakref import ref
 
 from torch import nn
 
+from gridreg.attach._hooks import attach
 from gridreg.errors import InputError
 
 if TYPE_CHECKING:
     from gridreg.attach._attachment import Attachment
+    from gridreg.attach._slots import Slot
 
-__all__ = ["SuspendingMethod", "wrap"]
+__all__ = ["SuspendingMethod", "resume", "wrap"]
 
 
 class SuspendingMethod:
@@ -66,3 +69,20 @@ def wrap(attachment: Attachment, field: nn.Module, path: str) -> SuspendingMetho
         hint = f"; did you mean {', '.join(map(repr, near))}?" if near else ""
         raise InputError(f"suspends({path!r}): {type(field).__name__} has no such method{hint}")
     return SuspendingMethod(attachment, owner, name)
+
+
+def resume(
+    attachments: Sequence[Attachment], orphans: Sequence[tuple[nn.Module, str, Slot]]
+) -> Exception | None:
+    """Attach everything again; the first error is returned when all others are back."""
+    first: Exception | None = None
+    for entry in orphans:
+        attach(*entry)
+    for attachment in attachments:
+        attachment._suspensions -= 1
+        if attachment._suspensions == 0 and not attachment.removed:
+            try:
+                attachment.attach()
+            except Exception as error:
+                first = first or error
+    return first

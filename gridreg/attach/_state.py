@@ -1,15 +1,18 @@
-"""What the regularizers of a handle remember, as a flat dict of tensors and back."""
+"""Memories of the regularizers of a handle, to a flat dict of tensors and back, and masks written into parameters."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
+import torch
 from torch import Tensor
 
+from gridreg.attach._binding import Binding
+from gridreg.attach._resolve import raw_tensor
 from gridreg.attach._slots import Slot
 from gridreg.errors import InputError
 
-__all__ = ["load_state", "state_of"]
+__all__ = ["bake", "load_state", "state_of"]
 
 Slots = Mapping[tuple[str, str, str], Slot]
 
@@ -49,3 +52,25 @@ def load_state(slots: Slots, state: Mapping[str, Tensor], step: int) -> None:
         known[prefix].prepared_at = step
     for slot in slots.values():
         slot.refresh(prepare=slot.context.prepared_at != step)
+
+
+def bake(bindings: Sequence[Binding]) -> None:
+    """Write what the field reads in eval mode into its parameters.
+
+    Raises:
+        InputError: an output or input of a module is transformed, which no parameter can hold.
+    """
+    for binding in bindings:
+        if any(slot.active and match.place.kind != "parameters" for match, slot in binding.slots):
+            raise InputError(
+                f"{binding.name}: acts on the {binding.slots[0][0].place.kind} of a module, which no parameter can "
+                "hold; name its columns with gridreg.parameters(...), or go on until it is fully open"
+            )
+    with torch.no_grad():
+        for binding in bindings:
+            done: set[int] = set()
+            for match, slot in binding.slots:
+                raw = raw_tensor(match.module, match.attribute)
+                if id(raw) not in done:
+                    raw.copy_(slot(raw, training=False))
+                    done.add(id(raw))
