@@ -38,7 +38,7 @@ class AblationOptions:
     threads: int | None = None
     """Processor threads of each run; default: all with `local`, 1 otherwise."""
     address: str | None = None
-    """Of the Ray cluster: auto, or HOST:PORT; without it, one is started on this machine."""
+    """Address of the Ray cluster: auto, or HOST:PORT; without it, one is started on this machine."""
     ship_scenes: bool = False
     """Send the views to Ray's workers instead of letting them find the scenes by path."""
     dry_run: bool = False
@@ -134,7 +134,7 @@ def make_runner(options: AblationOptions) -> Runner:
 
 
 def _print_runs(study: Study, out: Path, options: AblationOptions) -> None:
-    """What a dry run prints; nothing is written."""
+    """Print the runs and an estimate of their time; nothing is written."""
     known: dict[str, RunResult] = {}
     if (out / "store.sqlite").is_file():
         known = {result.spec.hash: result for result in Store.open(out, create=False).results()}

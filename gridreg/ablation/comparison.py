@@ -22,7 +22,7 @@ LEVEL = 0.05
 
 @dataclass(frozen=True, order=True)
 class Setting:
-    """What the runs of one table have in common.
+    """Properties that the runs of one table have in common.
 
     Args:
         builtin: whether they are of the built-in scene.

@@ -1,4 +1,4 @@
-"""How masks open: an image of channels over iterations for each site."""
+"""Schedules of masks: an image of channels over iterations for each site."""
 
 from __future__ import annotations
 

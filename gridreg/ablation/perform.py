@@ -45,7 +45,7 @@ _KEPT = 2
 
 @dataclass(frozen=True)
 class TaskResult:
-    """What came of a run; with neither metrics nor a reason, it was interrupted.
+    """Outcome of a run; with neither metrics nor a reason, it was interrupted.
 
     Args:
         metrics: as `gridreg.training.execute` returned them.

@@ -1,4 +1,4 @@
-"""How far a study is, how long the rest takes, and what a dry run says."""
+"""Progress of a study, an estimate of the time left, and the lines of a dry run."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["Estimate", "StudyProgress", "dry_run_lines", "estimate"]
 
 @dataclass(frozen=True)
 class Estimate:
-    """What the runs that are left will take.
+    """Time that the runs that are left will take.
 
     Args:
         runs: that are left.
@@ -50,7 +50,7 @@ class Estimate:
 
 
 def estimate(results: Sequence[RunResult]) -> Estimate:
-    """What is left of some runs, from the seconds of those that are done.
+    """Estimate the time of the runs that are left from the seconds of those that are done.
 
     A run is likened to finished ones of the same preset, field and number of steps; failing that, the seconds of one
     step of all finished ones count.

@@ -17,7 +17,7 @@ from gridreg.errors import InputError
 __all__ = ["ANSWER_SECONDS", "check_answers", "connected", "import_ray"]
 
 ANSWER_SECONDS = 20.0
-"""How long an address may take to answer."""
+"""Time that an address may take to answer."""
 
 
 def import_ray(address: str | None = None) -> Any:

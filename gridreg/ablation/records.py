@@ -1,4 +1,4 @@
-"""What determines a run, what came of it, and the study that asks for it: plain records."""
+"""Plain records: the specification of a run, its result, and the study that asks for it."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _LATER = {"patches": 1, "patch_size": 8, "reshuffle": False}
 
 @dataclass(frozen=True)
 class RunSpec:
-    """What determines a run, and the name of the row it stands in.
+    """Everything that determines a run, and the name of the row it stands in.
 
     Args:
         label: name of the row in tables, such as ``few_tensorf`` or ``quick - TotalVariation``; two rows may ask for

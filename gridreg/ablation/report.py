@@ -43,10 +43,10 @@ _MACHINE = ("cpu", "instructions", "cores", "threads")
 
 
 class HasResults(Protocol):
-    """What a report asks of a store."""
+    """The part of a store that a report needs."""
 
     def results(self, study: Study) -> list[RunResult]:
-        """What is known of the runs of a study."""
+        """Results of the runs of a study, finished or not."""
 
 
 class _Histories:
@@ -139,7 +139,7 @@ def _page(study: Study, results: Sequence[RunResult], sections: Sequence[Section
 
 
 def findings(section: Section) -> dict[str, list[str]]:
-    """What the differences say: names of rows, with a remark, under ``better``, ``worse`` and so on."""
+    """Names of rows, with a remark, under ``better``, ``worse``, ``within noise`` and ``cannot be told``."""
     groups: dict[str, list[str]] = {"better": [], "worse": [], "within noise": [], "cannot be told": []}
     for row in section.rows:
         if row.is_baseline:
@@ -161,7 +161,7 @@ def _finding(row: Row) -> tuple[str, str]:
 
 
 def provenance(study: Study, results: Sequence[RunResult]) -> list[tuple[str, str]]:
-    """Where the figures come from: protocols with their views, conventions of the metrics, versions and machines."""
+    """Origin of the figures: protocols with their views, conventions of the metrics, versions and machines."""
     done = [result for result in results if result.status == "done" and result.metrics is not None]
     entries: list[tuple[str, str]] = []
     for protocol in dict.fromkeys(spec.protocol for spec in study.runs):

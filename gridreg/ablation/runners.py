@@ -1,4 +1,4 @@
-"""Who does the runs of a study: the interface, and the runner that does them in this process, one after another."""
+"""Runners do the runs of a study: the interface, and the one that works in this process, run by run."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ __all__ = ["PAUSED", "Event", "InProcess", "Kind", "Report", "Runner", "serve", 
 Kind = Literal["started", "done", "failed", "interrupted", "lost"]
 
 PAUSED = "the study is paused, and the same command goes on from here when there is space"
-"""What is said of a full disk."""
+"""Said of a full disk."""
 
 _POLL = 0.5
 

@@ -23,7 +23,7 @@ Verdict = Literal["higher", "lower", "within noise", "one pair", "no pair"]
 
 @dataclass(frozen=True, order=True)
 class Cell:
-    """What two runs must share to be a pair: all that determines a run, but the composition.
+    """Everything that determines a run but the composition: two runs that share it are a pair.
 
     Args:
         scene: its name.

@@ -134,7 +134,7 @@ class Store:
         return found[name]
 
     def results(self, study: Study | str | None = None) -> list[RunResult]:
-        """What is known of the runs of a study, in its order; of all runs without one.
+        """Results of the runs of a study, finished or not, in its order; of all runs without one.
 
         A run whose worker has died counts as waiting.
 

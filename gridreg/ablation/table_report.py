@@ -35,7 +35,7 @@ class ReportOptions:
     out: Path | None = None
     """HTML file; default: that of the table, with the ending .html. Tables stand beside it as .md and .tex."""
     title: str | None = None
-    """Of the report; default: the name of the table."""
+    """Title of the report; default: the name of the table."""
 
 
 @dataclass(frozen=True)

@@ -93,7 +93,7 @@ def duration(seconds: float) -> str:
 
 
 def notes_of(row: Row) -> list[str]:
-    """What a reader must know to judge a row."""
+    """Remarks that a reader needs to judge a row."""
     notes = [] if row.outcome in ("higher", "lower", "no result") else [row.outcome]
     if row.uses_alpha:
         notes.append("α")

@@ -1,4 +1,4 @@
-"""Who works on a run, and whether that process still lives."""
+"""The process that works on a run, and whether it still lives."""
 
 from __future__ import annotations
 
