@@ -399,3 +399,10 @@ def test_a_second_run_in_one_folder_is_refused(capsys: pytest.CaptureFixture[str
         )
     assert child.returncode == 2
     assert "another run is writing here" in child.stderr
+
+
+def test_the_backend_of_a_notebook_has_no_effect(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MPLBACKEND", "module://matplotlib_inline.backend_inline")
+    code = "import sys; from gridreg.cli import run_cli; "
+    code += "sys.exit(run_cli(lambda: int(__import__('matplotlib') is None)))"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from gridreg.errors import InputError
-from gridreg.scenes.images import area_mean, decode, read_rgba
+from gridreg.scenes.decoding import decode
+from gridreg.scenes.images import area_mean, read_rgba
 
 
 def paeth(a: int, b: int, c: int) -> int:

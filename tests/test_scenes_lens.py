@@ -19,9 +19,8 @@ from gridreg.errors import InputError
 from gridreg.scenes import builtin_scene, load_scene
 from gridreg.scenes.builtin.cameras import look_at_origin
 from gridreg.scenes.builtin.raycast import render_rgba
-from gridreg.scenes.images import read_rgba
+from gridreg.scenes.images import read_mask, read_rgba
 from gridreg.scenes.lens import NO_DISTORTION, LensDistortion, undistort
-from gridreg.scenes.masks import read_mask
 
 small = st.floats(-0.08, 0.08)
 lenses = st.builds(

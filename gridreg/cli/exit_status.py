@@ -82,6 +82,8 @@ def run_cli(program: Callable[[], int]) -> int:
         >>> run_cli(lambda: 0)
         0
     """
+    # Nothing here draws on a screen; what a notebook sets for its own process is often not installed beside us.
+    os.environ["MPLBACKEND"] = "agg"
     before = sys.stdout, sys.stderr
     output = _Output(sys.stdout, _PASS)
     sys.stdout, sys.stderr = output, _Output(sys.stderr, _PASS_LIVE)  # type: ignore[assignment]

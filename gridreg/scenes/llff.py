@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gridreg.errors import InputError
+from gridreg.scenes.decoding import image_size
 from gridreg.scenes.extent import Extent
 from gridreg.scenes.files import list_images, read_bytes
 from gridreg.scenes.frames import Frame, SceneFiles, StatedIntrinsics
 from gridreg.scenes.gate import check_pose
-from gridreg.scenes.images import image_size
 
 __all__ = ["ndc_rays", "read_llff"]
 

@@ -18,10 +18,10 @@ from gridreg.errors import InputError
 from gridreg.scenes import structure_from_motion
 from gridreg.scenes.colmap import frames_of_model, mask_of
 from gridreg.scenes.colmap_model import read_model
+from gridreg.scenes.decoding import decode, open_image
 from gridreg.scenes.files import EXTENSIONS, list_images, resolve_inside
 from gridreg.scenes.frames import Frame, SceneFiles
-from gridreg.scenes.images import copy_upright, decode, open_image, read_rgba
-from gridreg.scenes.masks import fit_mask
+from gridreg.scenes.images import copy_upright, fit_mask, read_rgba
 
 __all__ = ["Copied", "attach_masks", "copy_frames", "copy_images", "find_cameras", "shrink_images"]
 

@@ -14,12 +14,12 @@ from torch import Tensor
 
 from gridreg.errors import InputError
 from gridreg.memory import check_memory
+from gridreg.scenes.decoding import decode, image_size
 from gridreg.scenes.files import resolve_inside
 from gridreg.scenes.frames import Frame, SceneFiles
 from gridreg.scenes.gate import check_cameras
-from gridreg.scenes.images import area_mean, decode, image_size
+from gridreg.scenes.images import area_mean, fit_mask
 from gridreg.scenes.lens import undistort
-from gridreg.scenes.masks import fit_mask
 from gridreg.scenes.protocols import Protocol
 from gridreg.scenes.views import Views, World
 

@@ -20,8 +20,7 @@ from PIL import Image
 
 from gridreg.export import load_cameras, read_mesh
 from gridreg.scenes import Scene, default_protocol, load_scene
-from gridreg.scenes.images import read_rgba
-from gridreg.scenes.masks import read_mask
+from gridreg.scenes.images import read_mask, read_rgba
 from gridreg.training.strict_yaml import read_yaml
 
 __all__ = ["Input", "inputs"]
