@@ -85,7 +85,10 @@ class VMField(TensorialField):
 
     @torch.no_grad()
     def resample(self, resolution: tuple[int, int, int]) -> None:
-        """Replace every grid by its (bi)linear interpolation at new nodes; the corners stay where they are."""
+        """Replace every grid by its (bi)linear interpolation at new nodes (TensoRF's `upsample_volume_grid`).
+
+        The corners stay where they are.
+        """
         for planes, lines in self._pairs():
             for k in range(3):
                 a, b = PLANE_AXES[k]

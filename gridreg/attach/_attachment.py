@@ -260,7 +260,7 @@ class Attachment:
     # --- saving ----------------------------------------------------------------------------------
 
     def state(self) -> dict[str, Tensor]:
-        """What the regularizers remember, by "regularizer/kind/tensor/name"."""
+        """The memory of the regularizers, by "regularizer/kind/tensor/name"."""
         return state_of(self._slots)
 
     def load(self, state: Mapping[str, Tensor]) -> None:
@@ -270,7 +270,7 @@ class Attachment:
             stack.forget()
 
     def __getstate__(self) -> dict[str, Any]:
-        """What can be copied: a copy of a handle belongs to the copy of the field that comes with it."""
+        """The part that can be copied: a copy of a handle belongs to the copy of the field that comes with it."""
         return {**self.__dict__, "_snapshot": None, "_followers": [], "_suspensions": 0}
 
     def __setstate__(self, state: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""What a user is told who does not ask: a warning where something attached does not do what it seems to."""
+"""Warnings that come unasked: one where something attached does not do what it seems to."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ class Match:
 
 
 def raw_tensor(module: nn.Module, attribute: str) -> Tensor:
-    """What `_parameters` or `_buffers` hold, past any property that is attached."""
+    """The content of `_parameters` or `_buffers`, past any property that is attached."""
     tensor: Tensor | None = module._parameters.get(attribute)
     if tensor is None:
         tensor = module._buffers.get(attribute)

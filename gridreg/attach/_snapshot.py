@@ -23,7 +23,7 @@ class MaskedTensor(NamedTuple):
 
 
 class Snapshot:
-    """What `Handle.step` compares the field with: cheap, because it does so at every step.
+    """The state that `Handle.step` compares the field with: cheap, because it does so at every step.
 
     Attributes:
         tensors: parameters and buffers that slots transform, by regularizer and name.

@@ -33,7 +33,7 @@ class Handle(HandleParts):
 
     @property
     def regularizers(self) -> tuple[Regularizer, ...]:
-        """What is applied, in order."""
+        """The regularizers, in the order of `apply`."""
         return tuple(binding.regularizer for binding in self._attachment.bindings)
 
     @property

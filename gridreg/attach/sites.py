@@ -77,7 +77,7 @@ class Place:
 
     @property
     def channels(self) -> int | None:
-        """How many channels take part: the length of a mask at this place."""
+        """Number of channels that take part: the length of a mask at this place."""
         return self.size if self.selected is None else len(self.selected)
 
     def complete(self, size: int) -> None:

@@ -91,6 +91,6 @@ def run(options: EvalOptions) -> int:
 
 
 def _members(run: LoadedRun) -> dict[str, Any]:
-    """Of an ensemble, who belongs to it; nothing for a single run."""
+    """Members of an ensemble; nothing for a single run."""
     members = [{"preset": m.config.preset, "seed": m.config.seed, "steps": m.step} for m in run.members]
     return {"members": members} if members else {}

@@ -1,4 +1,4 @@
-"""How every program of gridreg ends: what bad input, Ctrl-C and a full disk look like, in one place."""
+"""Ends of every program of gridreg: what bad input, Ctrl-C and a full disk look like, in one place."""
 
 from __future__ import annotations
 

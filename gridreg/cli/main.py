@@ -20,7 +20,7 @@ __all__ = ["COMMANDS", "Command", "main", "options_of"]
 
 @dataclass(frozen=True)
 class Command:
-    """Where a command lives.
+    """A command and the place of its code.
 
     Args:
         about: one line for the overview.
@@ -105,7 +105,7 @@ def options_of(name: str) -> Any:
 
 
 def overview() -> str:
-    """What ``gridreg --help`` prints."""
+    """The text of ``gridreg --help``."""
     width = max(map(len, COMMANDS))
     lines = [f"  {name:<{width}}  {command.about}" for name, command in COMMANDS.items()]
     return "\n".join(

@@ -122,7 +122,7 @@ def eikonal(samples: RaySamples) -> Tensor:
 @register
 @dataclass(frozen=True)
 class OcclusionLoss(Regularizer):
-    """Density close to the cameras is penalised: see `occlusion_loss`.
+    """Density close to the cameras is penalised (FreeNeRF's `occ_reg_loss`): see `occlusion_loss`.
 
     Args:
         weight: factor of the loss; FreeNeRF: 0.01.

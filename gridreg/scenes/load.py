@@ -42,7 +42,7 @@ def load_scene(
     bounds: Sequence[Sequence[float]] | Tensor | None = None,
     opaque: bool = False,
 ) -> Scene:
-    """Read a scene under a protocol.
+    """Read a scene under a protocol (what a `DataParser` of nerfstudio does).
 
     Args:
         folder: the scene folder: Blender's ``transforms_train.json`` and ``transforms_test.json``; or one

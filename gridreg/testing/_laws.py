@@ -61,7 +61,7 @@ def removal(regularizer: Regularizer, subject: Subject) -> None:
 
 
 def idleness(regularizer: Regularizer, subject: Subject) -> None:
-    """What says that it is the identity leaves outputs bit-identical; a scheduled mask is it at its end."""
+    """A transform that says it is the identity leaves outputs bit-identical; a scheduled mask is it at its end."""
     field = subject.made()
     bare = seen(field)
     with apply(field, regularizer, total_steps=STEPS) as handle:

@@ -48,7 +48,7 @@ _STATE = "state.json"
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """What ``load_checkpoint`` read.
+    """Content of a checkpoint, as ``load_checkpoint`` read it.
 
     Args:
         state: the nested state as it was saved, tensors on the CPU.

@@ -1,4 +1,4 @@
-"""What happened during a run: a history of values and masks, kept as JSON lines and drawn as curves.
+"""Course of a run: a history of values and masks, kept as JSON lines and drawn as curves.
 
 Nothing here needs a display: figures are drawn by matplotlib's Agg backend, without its global state.
 """
@@ -197,10 +197,10 @@ def _draw_series(axes: Axes, name: str, rows: Sequence[Row]) -> None:
     if width < 2:
         axes.plot(steps, values, marker="o" if len(values) < 30 else "", markersize=3, label=_verbatim(name))
         return
-    (faint,) = axes.plot(steps, values, linewidth=0.6, alpha=0.35)
+    (thin,) = axes.plot(steps, values, linewidth=0.6, alpha=0.35)
     smooth = np.convolve(values, np.full(width, 1 / width), mode="valid")
     middle = np.convolve(steps, np.full(width, 1 / width), mode="valid")
-    axes.plot(middle, smooth, linewidth=1.6, color=faint.get_color(), label=_verbatim(name))
+    axes.plot(middle, smooth, linewidth=1.6, color=thin.get_color(), label=_verbatim(name))
 
 
 def _verbatim(text: str) -> str:

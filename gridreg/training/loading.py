@@ -60,7 +60,7 @@ def checkpoint_of(folder: str | Path) -> Path:
 
 
 def members_in(path: Path) -> tuple[list[dict[str, Any]], bool, str]:
-    """What a checkpoint says of each run in it, ``{"config": ..., "state": ...}``.
+    """Configuration and state of each run in a checkpoint, ``{"config": ..., "state": ...}``.
 
     Returns:
         One entry for each run; whether it is an ensemble; the fingerprint of the scene.

@@ -133,7 +133,7 @@ def _is_taken(folder: Path) -> bool:
 
 
 def output_folder(options: TrainOptions, config: RunConfig) -> Path:
-    """Where the run goes: as told, or a folder of its own below ``outputs``."""
+    """Output folder of the run: as told, or a folder of its own below ``outputs``."""
     if options.out is not None:
         return options.out
     if options.resume:

@@ -128,7 +128,7 @@ class Lpips:
 
     @property
     def convention(self) -> str:
-        """What the number means, for ``metrics.json``."""
+        """Convention of the number, for ``metrics.json``."""
         reach = "[-1, 1]" if self.input_range == "signed" else "[0, 1]"
         return f"LPIPS 0.1, network {self.network}, inputs in {reach}; lower is better"
 

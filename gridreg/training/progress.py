@@ -1,4 +1,4 @@
-"""How far a run is, on a terminal or in a log, and stopping it without losing anything.
+"""Progress of a run, on a terminal or in a log, and stopping it without losing anything.
 
 A terminal gets one live line; a log file gets a plain line every few seconds, so that it stays readable.
 The first Ctrl-C asks the loop to save and stop, the second one aborts.
@@ -177,7 +177,7 @@ class Interruption:
 
     @property
     def exit_status(self) -> int:
-        """What a program ends with by convention: 130 after Ctrl-C, 143 after SIGTERM, 0 if nobody asked."""
+        """Exit status by convention: 130 after Ctrl-C, 143 after SIGTERM, 0 if nobody asked."""
         return 0 if self.signal_number is None else 128 + self.signal_number
 
 

@@ -200,7 +200,7 @@ def _is_one_of(value: Any, choices: tuple[Any, ...]) -> bool:
 
 
 def _expected(hint: Any) -> str:
-    """What a type wants, in words."""
+    """A type in words."""
     members = alternatives(hint)
     if len(members) > 1:
         return " or ".join(_expected(member) for member in members)

@@ -37,7 +37,7 @@ def poses_between(first: Tensor, second: Tensor, share: Tensor, focus: Tensor) -
     """
 
     def along(poses: Tensor) -> tuple[Tensor, Tensor]:
-        """How far behind the focus a camera is, by its axis, and what is left beside that."""
+        """Distance of a camera behind the focus along its axis, and the rest beside that."""
         offset, axis = poses[:, :3, 3] - focus, poses[:, :3, 2]
         distance = (offset * axis).sum(dim=-1, keepdim=True)
         return distance, offset - distance * axis

@@ -1,4 +1,4 @@
-"""What a result was computed with, so that two results can be told apart."""
+"""Versions and machine that a result was computed with, so that two results can be told apart."""
 
 from __future__ import annotations
 

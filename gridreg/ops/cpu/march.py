@@ -201,7 +201,7 @@ def _fill(
 
 
 class _Blocks(NamedTuple):
-    """Whose blocks they are, in which version of the cells, and the blocks."""
+    """Owner of the blocks, version of the cells, and the blocks."""
 
     of: weakref.ref[Tensor]
     version: int | None
