@@ -68,7 +68,7 @@ class CPField(TensorialField):
 
     @torch.no_grad()
     def resample(self, resolution: tuple[int, int, int]) -> None:
-        """(`upsample_volume_grid`) Replace every line by its linear interpolation at new nodes; the ends stay where they are (`upsample_volume_grid`)."""
+        """Replace every line by its linear interpolation at new nodes (`upsample_volume_grid`); the ends stay."""
         for lines in (self.density_lines, self.appearance_lines):
             for k, axis in enumerate(LINE_AXES):
                 lines[k] = nn.Parameter(_resampled(lines[k], resolution[axis]))

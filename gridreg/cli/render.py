@@ -23,9 +23,9 @@ class RenderOptions:
     ]
     """Output folders of runs, or their checkpoints; the cameras are those of the first."""
     out: OptionalFile = None
-    """Video (.mp4, .gif), or a name without suffix for a folder of PNG frames; default: PATH.mp4 in the run's folder."""
+    """Video (.mp4, .gif), or a name without suffix for PNG frames; default: PATH.mp4 in the run's folder."""
     path: OptionalText = None
-    """turntable (default), spiral (default facing forward), train (through the training cameras), or a JSON file."""
+    """turntable (default), spiral (default facing forward), train (the training cameras), or a JSON file."""
     modes: tuple[Literal["rgb", "depth", "opacity"], ...] = ("rgb",)
     """What to show, side by side; depth has a scale in world units."""
     frames: int = 120
