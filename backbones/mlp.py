@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
@@ -16,7 +16,9 @@ from gridreg.attach.sites import Site, parameters
 from gridreg.encodings import octaves_of_channels, positional_encoding
 from gridreg.ops.fused_adam import FusedAdam
 from gridreg.ops.perceptron import Precision
-from gridreg.rendering import OccupancyGrid, RayMarchResult, Rays
+
+if TYPE_CHECKING:
+    from gridreg.rendering import OccupancyGrid, Rays
 
 __all__ = ["MLPField"]
 
@@ -178,7 +180,7 @@ class MLPField(nn.Module):
         occupancy: OccupancyGrid,
         jitter: Tensor,
         transmittance_bound: float,
-    ) -> RayMarchResult:
+    ) -> ops.RayMarchResult:
         """Coarse and fine samples of rays, and the density at all of them.
 
         The coarse samples are evenly spread, and looked at without gradient; the fine ones follow their
@@ -209,7 +211,7 @@ class MLPField(nn.Module):
             density = self._density_of(features)
         else:
             features, density = None, self.density(x)
-        return RayMarchResult(
+        return ops.RayMarchResult(
             offsets, index, t[ray, index], x, density, delta, met.long() * t.shape[1], features=features
         )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from contextlib import AbstractContextManager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
@@ -15,7 +15,9 @@ from backbones.decoders import Basis, make_decoder
 from gridreg import ops
 from gridreg.attach.sites import Site
 from gridreg.ops.fused_adam import FusedAdam
-from gridreg.rendering import OccupancyGrid, Rays
+
+if TYPE_CHECKING:
+    from gridreg.rendering import OccupancyGrid, Rays
 
 __all__ = ["TensorialField", "density_shift_for"]
 

@@ -10,9 +10,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gridreg._packing import check_samples, rectangle
 from gridreg.errors import InputError
-from gridreg.segments import optical_depth_to_weights, spread, sum_before, sum_per_ray
+from gridreg.segments import (
+    check_samples,
+    optical_depth_to_weights,
+    rectangle,
+    spread,
+    sum_before,
+    sum_per_ray,
+)
 
 __all__ = ["RaySamples"]
 

@@ -25,8 +25,8 @@ from gridreg.ablation.runners import InProcess
 from gridreg.ablation.store import Store
 from gridreg.ablation.worker import main as worker_main
 from gridreg.ablation.workers import Worker
-from gridreg.cores import usable_cores
 from gridreg.errors import InputError
+from gridreg.machine import usable_cores
 from gridreg.scenes import builtin_scene
 from gridreg.training import execute
 from gridreg.training.checkpoint import has_checkpoint

@@ -10,7 +10,7 @@ import textwrap
 
 import pytest
 
-from gridreg.cores import usable_cores
+from gridreg.machine import usable_cores
 from gridreg.ops.cpu.jit import cache, precompile
 from gridreg.ops.cpu.jit.compiler import Kernel
 

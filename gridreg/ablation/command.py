@@ -15,8 +15,8 @@ from gridreg.ablation.records import RunResult, Study
 from gridreg.ablation.runners import InProcess, Runner
 from gridreg.ablation.store import Store
 from gridreg.ablation.study import load_study
-from gridreg.cores import usable_cores
 from gridreg.errors import InputError, near_names
+from gridreg.machine import usable_cores
 
 __all__ = ["AblationOptions", "make_runner", "run"]
 

@@ -15,8 +15,8 @@ from gridreg.ablation.runners import PAUSED, Event, Report
 from gridreg.ablation.store import Store
 from gridreg.ablation.worker import EXIT_DISK_FULL
 from gridreg.ablation.workers import Worker
-from gridreg.cores import usable_cores
 from gridreg.errors import InputError
+from gridreg.machine import usable_cores
 from gridreg.training.files import output_errors
 from gridreg.training.progress import interruptible
 

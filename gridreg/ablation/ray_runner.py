@@ -15,8 +15,8 @@ from gridreg.ablation.records import Study
 from gridreg.ablation.runners import Event, Kind, Report, settle
 from gridreg.ablation.store import Store
 from gridreg.ablation.workers import Worker
-from gridreg.cores import usable_cores
 from gridreg.errors import InputError
+from gridreg.machine import usable_cores
 from gridreg.training.progress import Interruption, interruptible
 
 __all__ = ["RayRunner"]

@@ -11,7 +11,7 @@ from typing import Literal, TypeAlias
 
 from torch import Tensor, nn
 
-from gridreg.attach.sites import Grid, Place, Selector, Site, SiteLike
+from gridreg.attach.sites import Grid, Place, Selector, Site, SiteLike, spatial_axes
 from gridreg.errors import InputError, near_names
 
 __all__ = ["Match", "find", "raw_tensor", "register_adapter", "sites_of"]
@@ -19,8 +19,6 @@ __all__ = ["Match", "find", "raw_tensor", "register_adapter", "sites_of"]
 # DistributedDataParallel and DataParallel, and torch.compile.
 _WRAPPERS = re.compile(r"^((module|_orig_mod)\.)+")
 
-# No grid has so many nodes along an edge: an axis beyond is the entries of a table.
-_LONGEST_EDGE = 4096
 
 Adapter: TypeAlias = Callable[[nn.Module], Mapping[str, "Site | Selector"]]
 
@@ -207,7 +205,7 @@ def _find_parameters(field: nn.Module, selector: Selector) -> list[Match]:
     for name, tensor in tensors.items():
         path, _, attribute = name.rpartition(".")
         stack = _checked_stack(name, tensor, dims[name], selector)
-        spatial = _spatial_axes(tensor, dims[name], selector.spatial, stack)
+        spatial = spatial_axes(tensor, dims[name], selector.spatial, stack)
         place = Place(name, selector, dims[name], spatial, selector.octaves, stack=stack)
         place.complete(tensor.shape[dims[name]])
         matches.append(Match(place, field.get_submodule(path), attribute))
@@ -289,17 +287,3 @@ def _checked_stack(name: str, tensor: Tensor, dim: int, selector: Selector) -> i
     if selector.item is not None and selector.item not in range(shape[axis]):
         raise InputError(f"item={selector.item!r} of {selector}: {name} holds {shape[axis]} grids, from 0")
     return axis
-
-
-def _spatial_axes(
-    tensor: Tensor, dim: int, spatial: tuple[int, ...] | None, stack: int | None
-) -> tuple[int, ...]:
-    """Spatial axes of a grid: given, or after a leading channel axis, or before a trailing one; none of a table."""
-    if spatial is not None:
-        return tuple(sorted(axis % tensor.ndim for axis in spatial))
-    leading = dim in (0, 1) and dim != tensor.ndim - 1
-    axes = [axis for axis in (range(dim + 1, tensor.ndim) if leading else range(dim)) if axis != stack]
-    entries_by_features = dim == tensor.ndim - 1 and len(axes) == 1
-    if entries_by_features or any(tensor.shape[axis] > _LONGEST_EDGE for axis in axes):
-        return ()
-    return tuple(axis for axis in axes if tensor.shape[axis] > 1)

@@ -14,6 +14,9 @@ from gridreg.errors import InputError
 
 __all__ = ["Grid", "Place", "Selector", "Site", "SiteLike", "inputs", "outputs", "parameters"]
 
+# No grid has so many nodes along an edge: an axis beyond is the entries of a table.
+_LONGEST_EDGE = 4096
+
 
 @dataclass(frozen=True)
 class Site:
@@ -139,3 +142,17 @@ class Grid:
     def whole(self) -> bool:
         """Whether this is all of its parameter."""
         return self.selected is None and self.entry is None
+
+
+def spatial_axes(
+    tensor: Tensor, dim: int, spatial: tuple[int, ...] | None, stack: int | None
+) -> tuple[int, ...]:
+    """Spatial axes of a grid: given, or after a leading channel axis, or before a trailing one; none of a table."""
+    if spatial is not None:
+        return tuple(sorted(axis % tensor.ndim for axis in spatial))
+    leading = dim in (0, 1) and dim != tensor.ndim - 1
+    axes = [axis for axis in (range(dim + 1, tensor.ndim) if leading else range(dim)) if axis != stack]
+    entries_by_features = dim == tensor.ndim - 1 and len(axes) == 1
+    if entries_by_features or any(tensor.shape[axis] > _LONGEST_EDGE for axis in axes):
+        return ()
+    return tuple(axis for axis in axes if tensor.shape[axis] > 1)

@@ -13,7 +13,7 @@ from torch import Tensor
 from gridreg.errors import InputError
 from gridreg.export.camera_files import load_cameras
 from gridreg.export.cameras import Orbit, Vector, look_at, orbit_of_box, orbit_of_views, up_axis
-from gridreg.memory import check_memory
+from gridreg.machine import check_memory
 from gridreg.rendering.cameras import Camera, Lens
 from gridreg.scenes import IN_PLACE, Views, World
 from gridreg.scenes.extent import focus_point

@@ -12,7 +12,7 @@ from scipy.spatial import KDTree  # type: ignore[import-untyped]
 
 from gridreg.errors import InputError
 from gridreg.export.mesh import Mesh
-from gridreg.memory import check_memory
+from gridreg.machine import check_memory
 
 __all__ = ["MeshComparison", "compare_meshes", "sample_surface"]
 

@@ -21,7 +21,7 @@ from gridreg.export._glb import Y_UP, glb_of, srgb_of
 from gridreg.export.decimation import check_faces, decimate
 from gridreg.export.marching import Faces, Vertices, drop_small_components, polygonise, vertex_normals
 from gridreg.export.volume import SeenDensity, sample_density, surface_threshold
-from gridreg.memory import check_memory
+from gridreg.machine import check_memory
 from gridreg.rendering import Field, OccupancyGrid
 from gridreg.scenes import IN_PLACE, World
 from gridreg.segments import optical_depth_to_weights

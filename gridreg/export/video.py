@@ -11,7 +11,7 @@ import numpy as np
 from gridreg.errors import InputError
 from gridreg.export.images import DepthRange, check_mode, colour_bar, depth_range, to_image
 from gridreg.export.writers import check_target, write_video
-from gridreg.memory import check_memory
+from gridreg.machine import check_memory
 from gridreg.rendering import Rendered
 from gridreg.rendering.cameras import Camera
 from gridreg.rendering.model import Model

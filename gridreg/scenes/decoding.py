@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from PIL import ExifTags, Image, ImageFile, UnidentifiedImageError
 
 from gridreg.errors import InputError
-from gridreg.memory import check_memory
+from gridreg.machine import check_memory
 from gridreg.scenes.files import read_bytes
 
 __all__ = ["SIDEWAYS", "Decoded", "decode", "exif_orientation", "exif_turn", "image_size", "open_image"]

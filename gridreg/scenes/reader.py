@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gridreg.errors import InputError
-from gridreg.memory import check_memory
+from gridreg.machine import check_memory
 from gridreg.scenes.decoding import decode, image_size
 from gridreg.scenes.files import resolve_inside
 from gridreg.scenes.frames import Frame, SceneFiles

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from gridreg.attach._hooks import slots_of, strip
 from gridreg.attach._notices import AttachWarning
@@ -30,6 +30,8 @@ from gridreg.testing._subjects import (
     expect,
     observed,
     rays_of,
+    renew,
+    renew_lists,
     same,
     samples_of,
     seen,
@@ -144,29 +146,12 @@ def replacement(regularizer: Regularizer, subject: Subject) -> None:
         handle.step(3)
         before = observed(field, handle)
         with handle.suspended():
-            _renew(field)
+            renew(field)
         expect(same(observed(field, handle), before), "other numbers after equal parameters came in")
-        _renew_lists(field)
+        renew_lists(field)
         handle.step(3)
         if not type(regularizer).train_only:
             expect(same(observed(field, handle), before), "other numbers after new lists came in")
-
-
-def _renew(field: nn.Module) -> None:
-    """Assign an equal parameter to every name, and a new list to every list."""
-    for module in list(field.modules()):
-        for key, parameter in list(module._parameters.items()):
-            if parameter is not None:
-                setattr(module, key, nn.Parameter(parameter.detach().clone()))
-    _renew_lists(field)
-
-
-def _renew_lists(field: nn.Module) -> None:
-    """Put new lists of the raw parameters in the place of every `ParameterList`."""
-    for module in list(field.modules()):
-        for key, child in list(module._modules.items()):
-            if isinstance(child, nn.ParameterList):
-                module._modules[key] = nn.ParameterList(child._parameters.values())
 
 
 def plain_data(regularizer: Regularizer, subject: Subject) -> None:

@@ -182,3 +182,20 @@ def tensor_for(context: Context, seed: int = 0) -> Tensor:
     shape[place.dim] = place.size
     generator = torch.Generator().manual_seed(seed)
     return torch.randn(shape, generator=generator, dtype=torch.float64, requires_grad=True)
+
+
+def renew(field: nn.Module) -> None:
+    """Assign an equal parameter to every name, and a new list to every list."""
+    for module in list(field.modules()):
+        for key, parameter in list(module._parameters.items()):
+            if parameter is not None:
+                setattr(module, key, nn.Parameter(parameter.detach().clone()))
+    renew_lists(field)
+
+
+def renew_lists(field: nn.Module) -> None:
+    """Put new lists of the raw parameters in the place of every `ParameterList`."""
+    for module in list(field.modules()):
+        for key, child in list(module._modules.items()):
+            if isinstance(child, nn.ParameterList):
+                module._modules[key] = nn.ParameterList(child._parameters.values())

@@ -14,7 +14,7 @@ import gridreg
 from gridreg.base import Regularizer
 from gridreg.errors import InputError
 from gridreg.fields import make_field
-from gridreg.memory import check_memory
+from gridreg.machine import check_memory
 from gridreg.scenes import IN_PLACE, Scene, builtin_scene, default_protocol, load_scene
 from gridreg.training.checkpoint import load_checkpoint, save_checkpoint
 from gridreg.training.config import to_data

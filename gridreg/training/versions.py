@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 import gridreg
-from gridreg.cores import usable_cores
+from gridreg.machine import usable_cores
 
 __all__ = ["cpu_model", "package_version", "versions"]
 

@@ -15,7 +15,7 @@ import os
 import subprocess
 import sys
 
-from gridreg.cores import usable_cores
+from gridreg.machine import usable_cores
 from gridreg.ops.cpu.mlp.gemm_tile import has
 
 __all__ = ["main", "start"]

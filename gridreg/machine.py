@@ -1,4 +1,4 @@
-"""Memory that this process may still take, asked before something large is begun."""
+"""The machine: cores that this process may use, and whether what is asked for fits into memory."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 from gridreg.errors import InputError
 
-__all__ = ["available_memory", "check_memory"]
+__all__ = ["available_memory", "check_memory", "usable_cores"]
 
 _CGROUP = (
     ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
@@ -59,3 +59,8 @@ def check_memory(needed: float, what: str) -> None:
     left = available_memory()
     if left is not None and needed > left:
         raise InputError(f"{what}: needs {needed / 1e9:.1f} GB of memory, found {left / 1e9:.1f} GB")
+
+
+def usable_cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

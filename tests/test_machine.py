@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from gridreg import memory
+from gridreg import machine
 from gridreg.errors import InputError
 from gridreg.export import Mesh, camera_path, compare_meshes
 from gridreg.export.writers import check_target
@@ -19,23 +19,23 @@ from gridreg.training import RunConfig, TrainSettings, build_trainer
 
 
 def test_says_how_much(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(memory, "available_memory", lambda: 3 * 10**9)
-    memory.check_memory(2.9e9, "this")
+    monkeypatch.setattr(machine, "available_memory", lambda: 3 * 10**9)
+    machine.check_memory(2.9e9, "this")
     with pytest.raises(InputError, match=re.escape("that: needs 3.1 GB of memory, found 3.0 GB")):
-        memory.check_memory(3.1e9, "that")
-    monkeypatch.setattr(memory, "available_memory", lambda: None)
-    memory.check_memory(1e18, "where nobody knows")
+        machine.check_memory(3.1e9, "that")
+    monkeypatch.setattr(machine, "available_memory", lambda: None)
+    machine.check_memory(1e18, "where nobody knows")
 
 
 def test_the_machine_has_some() -> None:
-    left = memory.available_memory()
+    left = machine.available_memory()
     assert left is None or 2**20 < left < 2**50
 
 
 def test_scenes_are_measured_before_they_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = builtin_scene(tmp_path, size=16)
     # 33 images of 16x16, seven floats a pixel: more than 200,000 bytes, which a single image does not take.
-    monkeypatch.setattr(memory, "available_memory", lambda: 200_000)
+    monkeypatch.setattr(machine, "available_memory", lambda: 200_000)
     with pytest.raises(InputError, match=r"lighthouse_16: 33 images of 16x16 .*: needs 0\.0 GB"):
         load_scene(folder, "builtin8")
     assert len(load_scene(folder, "builtin8", test=()).train) == 8
@@ -44,7 +44,7 @@ def test_scenes_are_measured_before_they_are_read(tmp_path: Path, monkeypatch: p
 @pytest.mark.parametrize("changes", [{"rays": 10**9}, {"voxels_start": 10**9}, {"voxels_end": 10**9}])
 def test_grids_and_batches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changes: dict[str, Any]) -> None:
     scene = load_scene(builtin_scene(tmp_path, size=16), "builtin8", test=())
-    monkeypatch.setattr(memory, "available_memory", lambda: 5 * 10**8)
+    monkeypatch.setattr(machine, "available_memory", lambda: 5 * 10**8)
     config = RunConfig(train=TrainSettings(**changes))
     with pytest.raises(InputError, match=r"train\..*: needs .* GB of memory"):
         build_trainer(config, scene)
