@@ -58,6 +58,7 @@ def test_what_a_worker_sends_stays_in_its_folder(tmp_path, name):
 
 def test_ray_is_an_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
+    monkeypatch.setattr(os, "environ", dict(os.environ))
     with pytest.raises(InputError, match=r"Ray is not installed.*gridreg\[ray\]"):
         ray_cluster.import_ray()
 
@@ -200,6 +201,10 @@ def cluster(tmp_path_factory):
         # Ray's own start and end, which leave sockets and logs to the garbage collector.
         warnings.simplefilter("ignore")
         from ray.cluster_utils import Cluster
+
+        # Tests before this one may have asked for a cluster of their own, with a token.
+        for name in [name for name in os.environ if name.startswith("RAY_AUTH")]:
+            patch.delenv(name)
 
         # The runs of other programs on this machine are none of this test's; Ray's sockets need short names.
         folder = tmp_path_factory.mktemp("nodes")

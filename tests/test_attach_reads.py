@@ -200,13 +200,6 @@ def test_reading_on_the_meta_device_does_not_move_the_mask() -> None:
         assert not field.lines[0][:, 6:].any()
 
 
-@pytest.mark.parametrize("make", [gridreg.FrequencyMask, gridreg.CosineMask, gridreg.LevelMask])
-def test_a_tensor_without_channels_is_refused(make: Any) -> None:
-    field = nn.ParameterDict({"k0": torch.zeros(1, 0, 4, 4, 4)})
-    with pytest.raises(gridreg.InputError, match="k0: has no channels on axis 1"):
-        gridreg.apply(field, make(gridreg.parameters("k0", dim=1)), total_steps=9)
-
-
 def test_bake_writes_what_the_field_reads() -> None:
     field = nn.Sequential(nn.Linear(9, 9), nn.Linear(9, 2))
     first = gridreg.FrequencyMask(gridreg.parameters("0.weight", dim=1), until=7)

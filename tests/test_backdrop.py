@@ -7,6 +7,7 @@ import pytest
 import torch
 from PIL import Image
 
+from gridreg.attach._notices import AttachWarning
 from gridreg.scenes import builtin_scene, load_scene
 from gridreg.training import RunConfig, build_trainer, execute
 from tests.tiny_training import NO_EVENTS
@@ -48,7 +49,9 @@ def test_the_paper_is_the_background(opaque, tmp_path, capfd):
     torch.testing.assert_close(scene.background, torch.tensor(GREY), atol=1e-2, rtol=0)
     trainer = build_trainer(CONFIG, scene)
     assert torch.equal(behind(trainer), scene.background.expand(64, 3))
-    execute(CONFIG, scene, tmp_path / "run")
+    trainer.handle.remove()
+    with pytest.warns(AttachWarning, match="RandomBackground not asked yet"):
+        execute(CONFIG, scene, tmp_path / "run")
     said = "".join(capfd.readouterr())
     assert "opaque photographs on one colour (0.80, 0.60, 0.40): it is the background" in said
     given = load_scene(opaque, "holdout8", background="black")

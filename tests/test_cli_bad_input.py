@@ -234,7 +234,7 @@ def test_names_and_numbers(refused: Refused, scene: Path) -> None:
     assert "did you mean 'quick'?" in refused(*words, "--preset", "quik")
     assert "expected one of" in refused(*words, "--protocol", "dietnerf")
     assert "expected one of" in refused(*words, "--backbone", "vmx")
-    assert "--steps: found 0, expected at least 1" in refused(*words, "--steps", "0")
+    assert "--steps: found 0, expected a number of at least 1" in refused(*words, "--steps", "0")
     assert "train.ray" in refused(*words, "--set", "train.ray=5")
     assert "found 'train.rays', expected KEY=VALUE" in refused(*words, "--set", "train.rays")
     assert "missing.yaml" in refused(*words, "--config", "missing.yaml")
@@ -281,7 +281,7 @@ def test_an_empty_field(refused: Refused, tmp_path: Path, empty_run: Path) -> No
     assert "opaque, expected 0.5 for a surface" in line
     line = refused("mesh", run, "--resolution", "16", "--threshold", "5", "--out", "mesh.ply")
     assert "threshold=5" in line
-    assert "found suffix '.stl'" in refused("mesh", run, "--out", "mesh.stl")
+    assert "found suffix '.xyz'" in refused("mesh", run, "--out", "mesh.xyz")
 
 
 def test_another_scene(refused: Refused, tmp_path: Path, empty_run: Path, scene: Path) -> None:

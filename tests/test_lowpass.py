@@ -227,11 +227,12 @@ class TestAttached:
         field = Planes(8)
         before = field.grids[1].detach().clone()
         site = gridreg.parameters("grids.1", dim=-1, channels=[0, 2])
-        gridreg.apply(field, FourierLowPass(site, 0.25), total_steps=100)
+        handle = gridreg.apply(field, FourierLowPass(site, 0.25), total_steps=100)
         after = field.grids[1].detach()
         assert torch.equal(after[..., 1], before[..., 1])
         expected = fourier_low_pass(before[..., [0, 2]], (0, 1), 0.25)
         torch.testing.assert_close(after[..., [0, 2]], expected)
+        handle.remove()
 
     def test_a_compiled_field_follows_the_step(self) -> None:
         field = Planes(8)

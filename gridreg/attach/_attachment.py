@@ -142,8 +142,6 @@ class Attachment:
     def _slot(self, binding: Binding, match: Match) -> Slot:
         """The slot of this tensor: the one from before if the channels are the same."""
         place = match.place
-        if place.size == 0:
-            raise InputError(f"{place.name}: has no channels on axis {place.dim}; leave it out of the site")
         key = (binding.name, place.kind, place.name)
         slot = self._slots.get(key)
         before = None if slot is None else slot.context.place
