@@ -19,14 +19,7 @@ from gridreg.regularizers.backgrounds import (
     random_background,
 )
 from gridreg.regularizers.channel_masks import CosineMask, FixedMask, FrequencyMask
-from gridreg.regularizers.density import (
-    CauchySparsity,
-    Eikonal,
-    OcclusionLoss,
-    cauchy_sparsity,
-    eikonal,
-    occlusion_loss,
-)
+from gridreg.regularizers.density import CauchySparsity, Eikonal, cauchy_sparsity, eikonal
 from gridreg.regularizers.depth_prior import DepthPrior, depth_correlation, depth_ranking, depth_residual
 from gridreg.regularizers.dropout import ComponentDropout, component_dropout
 from gridreg.regularizers.filters import fourier_low_pass, gaussian_blur
@@ -45,6 +38,7 @@ from gridreg.regularizers.mask_functions import (
     printed_frequency_mask,
     spherical_bands,
 )
+from gridreg.regularizers.occlusion import OcclusionLoss, occlusion_loss
 from gridreg.regularizers.optimizer import LearningRate, WeightDecay, split_groups
 from gridreg.regularizers.patches import (
     DepthSmoothness,
@@ -64,7 +58,12 @@ from gridreg.regularizers.rays import (
     ray_entropy,
 )
 from gridreg.regularizers.sample_space import SampleSpaceAnnealing, anneal_space
-from gridreg.regularizers.smoothness import TimeSmoothness, TotalVariation, time_smoothness, total_variation
+from gridreg.regularizers.total_variation import (
+    TimeSmoothness,
+    TotalVariation,
+    time_smoothness,
+    total_variation,
+)
 from gridreg.samples import RaySamples
 from gridreg.schedules import (
     Cosine,

@@ -16,7 +16,7 @@ from PIL import Image
 
 from gridreg.ablation.charts import Series, _end_labels, curves, line_chart, over_views, styles
 from gridreg.ablation.comparison import Section, compare
-from gridreg.ablation.differences import forest_plot, heat_map
+from gridreg.ablation.forest_plot import forest_plot, heat_map
 from gridreg.ablation.mask_images import colour_scale, mask_schedules
 from gridreg.ablation.records import RunResult
 from gridreg.ablation.wipes import encode

@@ -17,7 +17,7 @@ from gridreg.attach.sites import Grid, parameters
 from gridreg.base import Clock, Context, LocalTerm
 from gridreg.errors import InputError
 from gridreg.regularizers.grids import L1, Orthogonality, l1, orthogonality
-from gridreg.regularizers.smoothness import TotalVariation, total_variation
+from gridreg.regularizers.total_variation import TotalVariation, total_variation
 from tests import oracles
 
 CONTEXT = Context(Clock(100, seed=0))

@@ -14,7 +14,8 @@ from torch.autograd import gradcheck
 
 from gridreg.base import Clock, Context
 from gridreg.errors import InputError
-from gridreg.regularizers.density import CauchySparsity, OcclusionLoss, cauchy_sparsity, occlusion_loss
+from gridreg.regularizers.density import CauchySparsity, cauchy_sparsity
+from gridreg.regularizers.occlusion import OcclusionLoss, occlusion_loss
 from gridreg.samples import RaySamples
 from gridreg.schedules import Linear
 from tests import oracles

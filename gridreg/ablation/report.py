@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 from gridreg.ablation.charts import curves, over_views, styles
 from gridreg.ablation.comparison import Row, Section, compare
-from gridreg.ablation.differences import forest_plot, heat_map
+from gridreg.ablation.forest_plot import forest_plot, heat_map
 from gridreg.ablation.mask_images import colour_scale, mask_schedules
 from gridreg.ablation.records import RunResult, Study
 from gridreg.ablation.tables import (

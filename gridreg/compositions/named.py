@@ -9,12 +9,12 @@ from typing import Literal
 from gridreg.base import Regularizer
 from gridreg.errors import InputError, near_names
 from gridreg.regularizers.channel_masks import FixedMask, FrequencyMask
-from gridreg.regularizers.density import OcclusionLoss
 from gridreg.regularizers.grids import L1, Orthogonality
 from gridreg.regularizers.level_masks import ViewDependenceMask
 from gridreg.regularizers.low_pass import FourierLowPass, GridBlur
+from gridreg.regularizers.occlusion import OcclusionLoss
 from gridreg.regularizers.optimizer import WeightDecay
-from gridreg.regularizers.smoothness import TotalVariation
+from gridreg.regularizers.total_variation import TotalVariation
 from gridreg.schedules import Linear, Piecewise
 
 __all__ = ["RETIRED", "composition", "composition_names", "register_composition"]

@@ -13,7 +13,7 @@ from torch.autograd.function import once_differentiable
 
 from gridreg.attach.sites import Grid, SiteLike
 from gridreg.base import Context, LocalTerm, Regularizer, register
-from gridreg.regularizers.smoothness import spatial_axes
+from gridreg.regularizers.total_variation import spatial_axes
 from gridreg.schedules import Numeric
 
 __all__ = ["L1", "L2", "Orthogonality", "l1", "l2", "orthogonality"]

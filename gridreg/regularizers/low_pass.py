@@ -13,7 +13,7 @@ from gridreg.attach.sites import SiteLike
 from gridreg.base import NOT_NEGATIVE, Context, Regularizer, register, within
 from gridreg.errors import InputError
 from gridreg.regularizers.filters import Boundary, fourier_low_pass, gaussian_blur
-from gridreg.regularizers.smoothness import NO_NEIGHBOURS
+from gridreg.regularizers.total_variation import NO_NEIGHBOURS
 from gridreg.schedules import Linear, Numeric
 
 __all__ = ["FourierLowPass", "GridBlur", "annealed_radius"]

@@ -15,7 +15,12 @@ import gridreg
 from gridreg.attach.sites import Grid
 from gridreg.base import Clock, Context
 from gridreg.regularizers.grids import L2, l2
-from gridreg.regularizers.smoothness import TimeSmoothness, TotalVariation, time_smoothness, total_variation
+from gridreg.regularizers.total_variation import (
+    TimeSmoothness,
+    TotalVariation,
+    time_smoothness,
+    total_variation,
+)
 from tests import oracles
 
 CONTEXT = Context(Clock(100, seed=0))
