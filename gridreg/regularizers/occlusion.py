@@ -53,6 +53,7 @@ def occlusion_loss(
         InputError: both count and distance are given, `on` is unknown, or the prior finds no colours.
 
     Example:
+        >>> import torch
         >>> samples = RaySamples.from_dense(torch.arange(4.0), torch.ones(4), torch.ones(1, 4))
         >>> occlusion_loss(samples, 1).item(), occlusion_loss(samples, distance=1.5).item()
         (0.25, 0.5)

@@ -53,6 +53,7 @@ def psnr(image: Tensor, target: Tensor) -> float:
         InputError: if the shapes differ or are not ``(H, W, C)``.
 
     Example:
+        >>> import torch
         >>> psnr(torch.full((4, 4, 3), 0.5), torch.full((4, 4, 3), 0.6)) # doctest: +ELLIPSIS
         19.99999...
     """
@@ -77,6 +78,7 @@ def ssim(image: Tensor, target: Tensor, convention: SsimConvention = "gaussian")
         InputError: if the shapes differ, an image is smaller than the window, or the convention is unknown.
 
     Example:
+        >>> import torch
         >>> ssim(torch.zeros(16, 16, 3), torch.zeros(16, 16, 3))
         1.0
     """
