@@ -33,8 +33,7 @@ from gridreg.training.versions import versions
 
 STUDY = "foreign"
 SIZE, RAYS, SAMPLES = 100, 384, 64
-#: What validation views preferred, by field (`--candidates`).
-CHOSEN = {"tensorf": "smooth", "kplanes": "smooth", "hash": "smooth", "mlp": "smooth"}
+FIELDS = ("tensorf", "kplanes", "hash", "mlp")
 
 
 class Training:
@@ -183,6 +182,25 @@ def compare(
     print(f"{key}: {bare:.2f} -> {attached:.2f} dB, step {100 * (second / first - 1):+.0f} %", flush=True)
 
 
+def chosen(name: str, results: Path) -> str:
+    """Return the composition that gained most on validation views, in the mean of what `--candidates` stored.
+
+    Raises:
+        InputError: if nothing is stored for this field.
+    """
+    gains: dict[str, list[float]] = {}
+    for record in stored.load(STUDY, results):
+        if record["field"] == name and record["split"] == "validation":
+            gains.setdefault(record["composition"], []).append(
+                record["psnr"]["attached"] - record["psnr"]["bare"]
+            )
+    if not gains:
+        raise gridreg.InputError(
+            f"--fields {name}: no composition is chosen yet; run with --candidates first"
+        )
+    return max(gains, key=lambda composition: statistics.fmean(gains[composition]))
+
+
 def main(words: Sequence[str] | None = None) -> int:
     """Parse the command line, and compare."""
     parser = argparse.ArgumentParser(
@@ -190,7 +208,7 @@ def main(words: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--data", type=Path, help="folder that holds the scenes")
     parser.add_argument("--scenes", nargs="+", default=["builtin"])
-    parser.add_argument("--fields", nargs="+", choices=list(CHOSEN), default=list(CHOSEN))
+    parser.add_argument("--fields", nargs="+", choices=FIELDS, default=list(FIELDS))
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--steps", type=int, default=600)
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
@@ -201,7 +219,11 @@ def main(words: Sequence[str] | None = None) -> int:
     for label in options.scenes:
         scene = open_scene(label, options.data)
         for name in options.fields:
-            names = list(compositions(make(name, scene.bounds, 0))) if options.candidates else [CHOSEN[name]]
+            names = (
+                list(compositions(make(name, scene.bounds, 0)))
+                if options.candidates
+                else [chosen(name, options.results)]
+            )
             for seed in options.seeds:
                 for composition in names:
                     compare(name, composition, scene, label, seed, options)

@@ -108,7 +108,7 @@ def make(name: str, bounds: Tensor, seed: int) -> Foreign:
         levels = gridreg.outputs("mlp_base_grid", dim=-1)
         mask = gridreg.LevelMask(levels, start=4, every=100, features=2)
         return Foreign(field, {"mlp_base_grid": 0.01}, (), mask)
-    octaves = gridreg.octaves_of_channels(8, 3, order="coordinate", include_input="last")
+    octaves = gridreg.octaves_of_channels(3, 8, order="coordinate", include_input="last")
     field = NeRFField(
         position_encoding=encodings.NeRFEncoding(
             in_dim=3, num_frequencies=8, min_freq_exp=0, max_freq_exp=7, include_input=True
