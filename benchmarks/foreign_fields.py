@@ -19,7 +19,7 @@ class Foreign(NamedTuple):
     field: nn.Module
     rates: dict[str, float]  # learning rate by the beginning of a parameter's name
     grids: tuple[Any, ...]  # raw grids, for penalties
-    mask: gridreg.Regularizer  # opens from coarse to fine
+    masks: tuple[gridreg.Regularizer, ...]  # open from coarse to fine
     grow: tuple[str, ...] = ()  # modules whose grids are upsampled on the way
 
 
@@ -81,9 +81,14 @@ def make(name: str, bounds: Tensor, seed: int) -> Foreign:
             **grids,
         )
         planes = [gridreg.parameters(f"{grid}.plane_coef", dim=1, stack=0) for grid in grids]
-        mask = gridreg.FrequencyMask(gridreg.parameters("*.line_coef", dim=1, stack=0), until=0.5)
+        lines = [gridreg.parameters(f"{grid}.line_coef", dim=1, stack=0) for grid in grids]
+        mask = [gridreg.FrequencyMask(line, until=0.5) for line in lines]
         return Foreign(
-            field, {"density_encoding": 0.02, "color_encoding": 0.02}, tuple(planes), mask, tuple(grids)
+            field,
+            {"density_encoding": 0.02, "color_encoding": 0.02},
+            tuple(planes),
+            tuple(mask),
+            tuple(grids),
         )
     if name == "kplanes":
         stub_tinycudann()
@@ -94,7 +99,7 @@ def make(name: str, bounds: Tensor, seed: int) -> Foreign:
         )
         grid = gridreg.parameters("grids.*.plane_coefs.*", dim=0)
         mask = gridreg.FrequencyMask(gridreg.outputs("grids.*", dim=-1), until=0.5)
-        return Foreign(field, {"grids": 0.02}, (grid,), mask)
+        return Foreign(field, {"grids": 0.02}, (grid,), (mask,))
     if name == "hash":
         field = NerfactoField(
             bounds,
@@ -105,9 +110,9 @@ def make(name: str, bounds: Tensor, seed: int) -> Foreign:
             appearance_embedding_dim=0,
             implementation="torch",
         )
-        levels = gridreg.outputs("mlp_base_grid", dim=-1)
+        levels = gridreg.outputs("mlp_base.model.0", dim=-1)
         mask = gridreg.LevelMask(levels, start=4, every=100, features=2)
-        return Foreign(field, {"mlp_base_grid": 0.01}, (), mask)
+        return Foreign(field, {"mlp_base.model.0": 0.01}, (), (mask,))
     octaves = gridreg.octaves_of_channels(3, 8, order="coordinate", include_input="last")
     field = NeRFField(
         position_encoding=encodings.NeRFEncoding(
@@ -123,7 +128,7 @@ def make(name: str, bounds: Tensor, seed: int) -> Foreign:
         skip_connections=(2,),
     )
     mask = gridreg.FrequencyMask(gridreg.outputs("position_encoding", octaves=octaves), until=0.5)
-    return Foreign(field, {}, (), mask)
+    return Foreign(field, {}, (), (mask,))
 
 
 def compositions(foreign: Foreign) -> dict[str, list[gridreg.Regularizer]]:
@@ -133,6 +138,6 @@ def compositions(foreign: Foreign) -> dict[str, list[gridreg.Regularizer]]:
     return {
         "rays": rays,
         "smooth": [*smooth, *rays],
-        "masked": [*smooth, *rays, foreign.mask],
-        "mask": [foreign.mask],
+        "masked": [*smooth, *rays, *foreign.masks],
+        "mask": [*foreign.masks],
     }

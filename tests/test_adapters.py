@@ -54,6 +54,25 @@ def test_few_tensorf_attaches_to_the_field_of_nerfstudio(nerfstudio_field: torch
         assert bool((raw != 0).all())
 
 
+def test_levels_of_the_hash_grid_of_nerfstudio(nerfstudio_field: torch.nn.Module) -> None:
+    from nerfstudio.cameras.rays import Frustums, RaySamples
+    from nerfstudio.fields.nerfacto_field import NerfactoField
+
+    bounds = torch.tensor([[-1.0] * 3, [1.0] * 3])
+    options = {"num_levels": 4, "max_res": 64, "log2_hashmap_size": 8, "appearance_embedding_dim": 0}
+    field = NerfactoField(bounds, num_images=1, implementation="torch", **options)
+    at = torch.rand(2, 3, 3)
+    one = torch.ones(2, 3, 1)
+    samples = RaySamples(Frustums(at, at, 0 * one, 0 * one, one), camera_indices=one.long())
+    mask = gridreg.LevelMask("levels", start=1, every=2, features=2)
+    with gridreg.apply(field, mask, total_steps=10) as handle:
+        handle.step(0)
+        field.get_density(samples)
+        assert (
+            handle.values["LevelMask(levels)"] == 0.25 if hasattr(handle, "values") else "yes" in str(handle)
+        )
+
+
 def test_octaves_of_the_encodings_of_nerfstudio(nerfstudio_field: torch.nn.Module) -> None:
     """A channel of octave k has the frequency of octave k: twice that of the one before."""
     encoding = nerfstudio_field.direction_encoding

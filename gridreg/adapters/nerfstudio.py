@@ -18,6 +18,7 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocati
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.engine.trainer import TrainerConfig
+from nerfstudio.field_components.encodings import HashEncoding
 from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.fields.nerfacto_field import NerfactoField
 from nerfstudio.fields.tensorf_field import TensoRFField
@@ -76,7 +77,8 @@ def _tensorf_sites(module: Any) -> dict[str, gridreg.Site]:
 
 def _nerfacto_sites(module: nn.Module) -> dict[str, gridreg.Site]:
     """Levels of the hash grid, coarse ones first, as `LevelMask` opens them."""
-    return {"levels": gridreg.Site((gridreg.outputs("mlp_base_grid", dim=-1),))}
+    names = [name for name, part in module.named_modules() if isinstance(part, HashEncoding)]
+    return {"levels": gridreg.Site((gridreg.outputs(names[0], dim=-1),))} if names else {}
 
 
 def _nerf_sites(module: Any) -> dict[str, gridreg.Site]:
