@@ -196,6 +196,9 @@ def test_reading_on_the_meta_device_does_not_move_the_mask() -> None:
         field.to("meta")
         assert field.lines[0].is_meta
         field.to_empty(device="cpu")
+        with torch.no_grad():
+            for parameter in field.parameters():
+                parameter.fill_(1)
         handle.step(1)
         assert not field.lines[0][:, 6:].any()
 
