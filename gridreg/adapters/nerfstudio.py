@@ -46,11 +46,16 @@ def ray_samples(samples: Any, density: Tensor, directions: Tensor | None = None)
     )
 
 
-def _encoded(pattern: str, encoding: Any, dimensions: int, start: int, **options: Any) -> Selector:
-    """Channels of an input that are a `NeRFEncoding`: coordinate by coordinate, the input itself at the end."""
+def _octaves(encoding: Any, dimensions: int) -> tuple[int, ...]:
+    """Octaves of a `NeRFEncoding`: coordinate by coordinate, the input itself at the end."""
     include: Any = "last" if encoding.include_input else False
-    octaves = octaves_of_channels(dimensions, encoding.num_frequencies, "coordinate", include)
-    return gridreg.inputs(pattern, channels=slice(start, start + len(octaves)), octaves=octaves, **options)
+    return octaves_of_channels(dimensions, encoding.num_frequencies, "coordinate", include)
+
+
+def _encoded(pattern: str, encoding: Any, dimensions: int, start: int) -> Selector:
+    """Channels of an input from ``start`` on that are a `NeRFEncoding`."""
+    octaves = _octaves(encoding, dimensions)
+    return gridreg.inputs(pattern, channels=slice(start, start + len(octaves)), octaves=octaves)
 
 
 def _tensorf_sites(module: Any) -> dict[str, gridreg.Site]:
@@ -83,13 +88,12 @@ def _nerfacto_sites(module: nn.Module) -> dict[str, gridreg.Site]:
 
 def _nerf_sites(module: Any) -> dict[str, gridreg.Site]:
     """FreeNeRF's two sites."""
-    found = {}
-    for name, owner in (("position", "position_encoding"), ("direction", "direction_encoding")):
-        encoding = getattr(module, owner)
-        include: Any = "last" if encoding.include_input else False
-        octaves = octaves_of_channels(3, encoding.num_frequencies, "coordinate", include)
-        found[f"encoding.{name}"] = gridreg.Site((gridreg.outputs(owner, octaves=octaves),))
-    return found
+    return {
+        f"encoding.{name}": gridreg.Site(
+            (gridreg.outputs(f"{name}_encoding", octaves=_octaves(getattr(module, f"{name}_encoding"), 3)),)
+        )
+        for name in ("position", "direction")
+    }
 
 
 gridreg.register_adapter(TensoRFField, _tensorf_sites)
@@ -103,7 +107,7 @@ class GridregTensoRFConfig(TensoRFModelConfig):  # type: ignore[misc]
 
     _target: type = field(default_factory=lambda: GridregTensoRF)
     composition: str = "few_tensorf"
-    """a composition by name; what its sites do not find on this field is left out, and said"""
+    """a composition by name; what has no site on this field is left out"""
     total_steps: int = 30_000
     """steps that schedules count; the length of the run"""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 from weakref import ref
@@ -10,7 +9,7 @@ from weakref import ref
 from torch import nn
 
 from gridreg.attach._hooks import attach
-from gridreg.errors import InputError
+from gridreg.errors import InputError, near_names
 
 if TYPE_CHECKING:
     from gridreg.attach._attachment import Attachment
@@ -65,8 +64,7 @@ def wrap(attachment: Attachment, field: nn.Module, path: str) -> SuspendingMetho
             for n in dir(owner)
             if not n.startswith("_") and callable(getattr(type(owner), n, None))
         ]
-        near = difflib.get_close_matches(path, names, n=3, cutoff=0.5)
-        hint = f"; did you mean {', '.join(map(repr, near))}?" if near else ""
+        hint = near_names(path, names, count=3)
         raise InputError(f"suspends({path!r}): {type(field).__name__} has no such method{hint}")
     return SuspendingMethod(attachment, owner, name)
 
