@@ -14,12 +14,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from gridreg.ablation.charts import Series, _end_labels, curves, line_chart, over_views, styles
+from gridreg.ablation.charts import curves, over_views, styles
 from gridreg.ablation.comparison import Section, compare
 from gridreg.ablation.forest_plot import forest_plot, heat_map
 from gridreg.ablation.mask_images import colour_scale, mask_schedules
 from gridreg.ablation.records import RunResult
-from gridreg.ablation.wipes import encode
+from gridreg.export.html import encode
+from gridreg.export.line_chart import Series, _end_labels, line_chart
 from tests.ablation_results import done, opened, spec, study_of
 from tests.test_ablation_report import decoded
 

@@ -16,8 +16,9 @@ from PIL import Image
 
 from gridreg.ablation.comparison import compare
 from gridreg.ablation.report import write_report
-from gridreg.ablation.wipes import LONGEST_SIDE, encode, wipe_data
+from gridreg.ablation.wipes import wipe_data
 from gridreg.errors import InputError
+from gridreg.export.html import LONGEST_SIDE, encode
 from tests.ablation_results import NASTY, VIEWS, Results, done, example, failed, save_history, spec, study_of
 
 VOID = {"meta", "link", "img", "br", "input", "circle", "line", "path", "polyline"}

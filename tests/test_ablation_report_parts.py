@@ -167,15 +167,27 @@ def test_slider_begins_with_the_baseline_and_the_best() -> None:
     assert wipe_data([own], 10**6) == [[]]
 
 
-@pytest.mark.parametrize("name", ["report.html", "report.css", "report.js", "tables.md", "tables.tex"])
-def test_parts_of_the_page_come_with_the_package(name: str) -> None:
-    text = (files("gridreg.ablation") / "page" / name).read_text(encoding="utf-8")
+OF_REPORT = [
+    f"gridreg.ablation/{name}"
+    for name in ("report.html", "report.css", "report.js", "tables.md", "tables.tex")
+]
+OF_RUN = [f"gridreg.export/{name}" for name in ("base.css", "head.html", "run.html", "run.css", "run.js")]
+
+
+def page_file(place: str) -> str:
+    package, name = place.split("/")
+    return (files(package) / "page" / name).read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("place", [*OF_REPORT, *OF_RUN])
+def test_parts_of_the_page_come_with_the_package(place: str) -> None:
+    text = page_file(place)
     assert len(text) > 200
     assert not re.search(r"https?://", text)
 
 
 def test_every_colour_exists_light_and_dark() -> None:
-    text = (files("gridreg.ablation") / "page" / "report.css").read_text(encoding="utf-8")
+    text = "".join(page_file(place) for place in (*OF_REPORT, *OF_RUN) if place.endswith(".css"))
     light, dark = re.findall(r":root \{(.*?)\}", text, re.S)
     names = re.findall(r"(--[\w-]+):", light)
     assert names == re.findall(r"(--[\w-]+):", dark)

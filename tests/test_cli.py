@@ -206,6 +206,7 @@ def test_eval_gives_the_same_score(desk: Path, capsys: pytest.CaptureFixture[str
     assert len(printed) == first["test_views"] + 1
     assert (desk / "again/test/r_0_compare.png").is_file()
     assert (desk / "again/test.png").is_file()
+    assert "photograph of r_0" in (desk / "again/index.html").read_text()
     # The checkpoint itself may be named, too.
     assert main(["eval", "run/checkpoint", "--scene", "lighthouse_32"]) == 0
 
@@ -226,6 +227,17 @@ def test_mesh_and_its_comparison(desk: Path, capsys: pytest.CaptureFixture[str])
     assert 0 < json.loads((desk / "figures.json").read_text())["chamfer_relative"] < 0.1
     assert main(["compare-mesh", "run/mesh.ply", "builtin", "--samples", "2000"]) == 0
     assert "Normal consistency" in capsys.readouterr().out
+
+
+def test_page_of_a_run(desk: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    # Training, and a score with a folder, have made one.
+    assert 'id="score"' in (desk / "run/index.html").read_text()
+    (desk / "run/index.html").unlink()
+    assert main(["page", "run"]) == 0
+    assert re.match(r"run/index\.html: \d+\.\d MB\n", capsys.readouterr().out)
+    text = (desk / "run/index.html").read_text()
+    assert text.count('alt="photograph ') - text.count('alt="photograph of') == 8
+    assert main(["page", "nowhere"]) == 2
 
 
 def test_render_films_and_frames(desk: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -107,13 +107,14 @@ def test_what_is_drawn_of_a_run(
 ) -> None:
     run = started(scene, tmp_path)
     run.trainer.occupancy.cells.zero_()
-    assert draw_run(run, video=False) == []
+    page = tmp_path / "index.html"
+    assert draw_run(run, video=False) == [page]
     assert capsys.readouterr().err.startswith("no mesh: ")
-    assert draw_run(run, mesh=False, video=False) == []
+    assert draw_run(run, mesh=False, video=False) == [page]
     facing = started(forward, tmp_path)
-    assert draw_run(facing) == [tmp_path / "spiral.mp4"]
+    assert draw_run(facing) == [tmp_path / "spiral.mp4", page]
     assert "not in world coordinates" in capsys.readouterr().err
-    assert {path.name for path in tmp_path.iterdir()} == {"spiral.mp4"}
+    assert {path.name for path in tmp_path.iterdir()} == {"spiral.mp4", "index.html"}
 
 
 def test_nobody_asked_for_a_view() -> None:

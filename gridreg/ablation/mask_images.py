@@ -11,7 +11,7 @@ from PIL import Image
 
 from gridreg.ablation.charts import Histories
 from gridreg.ablation.records import RunResult
-from gridreg.ablation.wipes import data_uri
+from gridreg.export.html import data_uri
 from gridreg.training.images import coloured
 
 __all__ = ["colour_scale", "mask_schedules"]

@@ -107,6 +107,7 @@ def _page(study: Study, results: Sequence[RunResult], sections: Sequence[Section
     source = study.source.encode("utf-8", "backslashreplace")
     return render(
         "report.html",
+        title=study.title,
         study=study,
         source_name=study.name if study.name.endswith(".csv") else f"{study.name}.yaml",
         done=sum(result.status == "done" for result in results),

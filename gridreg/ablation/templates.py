@@ -6,7 +6,9 @@ import re
 from functools import cache
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment
+
+from gridreg.export.html import page_environment
 
 __all__ = ["render"]
 
@@ -32,14 +34,7 @@ def render(template: str, **values: Any) -> str:
 
 @cache
 def _environment() -> Environment:
-    environment = Environment(
-        loader=PackageLoader("gridreg.ablation", "page"),
-        autoescape=lambda name: name is not None and name.endswith(".html"),
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
+    environment = page_environment("gridreg.ablation")
     environment.filters |= {"markdown": _markdown, "latex": _latex}
     return environment
 

@@ -2,27 +2,19 @@
 
 from __future__ import annotations
 
-import base64
-import io
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
-import numpy as np
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from gridreg.ablation.comparison import Section
 from gridreg.ablation.records import RunResult
+from gridreg.export.html import encode, open_image, spread_views, target_beside
 
-__all__ = ["LONGEST_SIDE", "VIEWS_PER_SCENE", "data_uri", "encode", "first_choice", "wipe_data"]
+__all__ = ["VIEWS_PER_SCENE", "first_choice", "wipe_data"]
 
-LONGEST_SIDE = 400
 VIEWS_PER_SCENE = 4
-
-_QUALITY = 88
-# Above the images in NAME_compare.png stand their names.
-_STRIP = 20
 
 
 def wipe_data(sections: Sequence[Section], budget: int) -> list[list[dict[str, Any]]]:
@@ -99,17 +91,13 @@ def _runs_of(section: Section, scene: str) -> dict[str, RunResult]:
 def _views_of(runs: Iterable[RunResult]) -> list[str]:
     """Names of test views that all runs have, evenly spread."""
     known = [set((run.metrics or {}).get("images", {})) for run in runs]
-    # By the number in the name: r_8 comes before r_16.
-    order = {name: int("".join(filter(str.isdecimal, name)) or 0) for names in known for name in names}
-    views = sorted(set.intersection(*known), key=lambda name: (order[name], name)) if known else []
-    spread = np.linspace(0, len(views) - 1, min(VIEWS_PER_SCENE, len(views))).round().astype(int)
-    return [views[index] for index in spread.tolist()]
+    return spread_views(set.intersection(*known), VIEWS_PER_SCENE) if known else []
 
 
 def _images(runs: Mapping[str, RunResult], view: str) -> list[dict[str, Any]]:
     images: list[dict[str, Any]] = []
     for name, run in runs.items():
-        render = _opened(run.images.get(view, run.folder / "test" / f"{view}.png"))
+        render = open_image(run.images.get(view, run.folder / "test" / f"{view}.png"))
         if render is None:
             continue
         if not images:
@@ -122,44 +110,6 @@ def _images(runs: Mapping[str, RunResult], view: str) -> list[dict[str, Any]]:
 
 
 def _target(run: RunResult, view: str, render: Image.Image) -> Image.Image | None:
-    """The target, which stands at the left of the comparison, enlarged by whole pixels, where it has no file."""
     if f"target:{view}" in run.images:
-        return _opened(run.images[f"target:{view}"])
-    comparison = _opened(run.folder / "test" / f"{view}_compare.png")
-    if comparison is None:
-        return None
-    zoom = (comparison.height - _STRIP) // render.height
-    if zoom < 1 or comparison.width < zoom * render.width:
-        return None
-    whole = comparison.crop((0, _STRIP, zoom * render.width, _STRIP + zoom * render.height))
-    return whole.resize(render.size, Image.Resampling.BOX)
-
-
-def _opened(path: Path) -> Image.Image | None:
-    try:
-        with Image.open(path, formats=["PNG", "JPEG"]) as image:
-            converted: Image.Image = image.convert("RGB")
-            return converted
-    except (OSError, UnidentifiedImageError, Image.DecompressionBombError):
-        return None
-
-
-def encode(image: Image.Image) -> str:
-    """An image as data URI, at most `LONGEST_SIDE` pixels: PNG, or JPEG without colour subsampling if smaller.
-
-    >>> encode(Image.new("RGB", (4, 4)))[:22]
-    'data:image/png;base64,'
-    """
-    if max(image.size) > LONGEST_SIDE:
-        scale = LONGEST_SIDE / max(image.size)
-        size = (max(1, round(image.width * scale)), max(1, round(image.height * scale)))
-        image = image.resize(size, Image.Resampling.BOX, reducing_gap=None)
-    return min(data_uri(image, "png"), data_uri(image, "jpeg"), key=len)
-
-
-def data_uri(image: Image.Image, kind: str = "png") -> str:
-    """An image as data URI, in the format ``png`` or ``jpeg``."""
-    buffer = io.BytesIO()
-    options: dict[str, Any] = {"optimize": True} if kind == "png" else {"quality": _QUALITY, "subsampling": 0}
-    image.save(buffer, format=kind, **options)
-    return f"data:image/{kind};base64," + base64.b64encode(buffer.getvalue()).decode()
+        return open_image(run.images[f"target:{view}"])
+    return target_beside(run.folder / "test" / f"{view}_compare.png", render)

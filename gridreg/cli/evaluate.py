@@ -27,7 +27,7 @@ class EvalOptions:
     lpips: OptionalFile = None
     """Weights of LPIPS as a safetensors file, network vgg or alex, for that distance as well; default: without it."""
     out: OptionalFolder = None
-    """Folder for metrics.json, test.png and test/ (renders beside their targets); default: print the score only."""
+    """Folder for metrics.json, test.png, test/ (renders beside their targets) and index.html; default: the score."""
 
 
 def run(options: EvalOptions) -> int:
@@ -36,7 +36,8 @@ def run(options: EvalOptions) -> int:
     Raises:
         InputError: for a missing or damaged checkpoint, another scene, other weights, or a place that is not writable.
     """
-    from gridreg.cli.runs import scene_of
+    from gridreg.cli.runs import folder_of, scene_of
+    from gridreg.export import write_page
     from gridreg.training import load_run
     from gridreg.training.config import to_data
     from gridreg.training.evaluate import Scored, score_views
@@ -86,7 +87,9 @@ def run(options: EvalOptions) -> int:
             [view.target for view in scored],
             psnrs=[view.metrics["psnr"] for view in scored],
         )
-    print(summary(record))
+    print(summary(record), flush=True)
+    if options.out is not None:
+        write_page(options.out, scene, run=folder_of(options.checkpoint))
     return 0
 
 

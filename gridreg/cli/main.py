@@ -49,6 +49,7 @@ COMMANDS: dict[str, Command] = {
     "view": _own("look at a checkpoint in the browser", "view", "ViewOptions"),
     "render": _own("render a video of one checkpoint, or of several side by side", "render", "RenderOptions"),
     "mesh": _own("cut a mesh out of a checkpoint", "mesh", "MeshOptions"),
+    "page": _own("make the page of a run, to pass on", "page", "PageOptions"),
     "compare-mesh": _own("measure a mesh against the true one", "compare_mesh", "CompareMeshOptions"),
     "ablate": Command(
         "compare compositions of regularizers over scenes and seeds",

@@ -12,6 +12,7 @@ from gridreg.errors import InputError
 from gridreg.export.browser import check_address
 from gridreg.export.camera_paths import camera_path
 from gridreg.export.mesh import write_mesh
+from gridreg.export.page import write_page
 from gridreg.export.video import render_video
 from gridreg.export.viewer import Viewer
 from gridreg.export.writers import find_ffmpeg
@@ -70,7 +71,8 @@ def check_drawing(*, video: bool = True) -> None:
 
 
 def draw_run(run: Execution, *, mesh: bool = True, video: bool = True) -> list[Path]:
-    """Write ``mesh.ply`` and ``turntable.mp4`` (forward-facing: ``spiral.mp4``) into the folder of a finished run.
+    """Write ``mesh.ply``, ``turntable.mp4`` (forward-facing: ``spiral.mp4``) and ``index.html`` into the folder of a
+    finished run.
 
     A field without a surface (a very short run) and a forward-facing scene get no mesh; standard error says why.
 
@@ -100,7 +102,7 @@ def draw_run(run: Execution, *, mesh: bool = True, video: bool = True) -> list[P
         target = run.out / ("spiral.mp4" if forward else "turntable.mp4")
         render_video(model, target, video_path(model, run.scene.train, frames=60, width=200))
         written.append(target)
-    return written
+    return [*written, write_page(run.out, run.scene)]
 
 
 class LiveView:

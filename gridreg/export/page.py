@@ -1,0 +1,270 @@
+"""One HTML file that shows a run, with nothing beside it and nothing from a network."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+from collections.abc import Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jinja2 import Environment
+from markupsafe import Markup
+from numpy.typing import NDArray
+from PIL import Image
+
+from gridreg.errors import InputError
+from gridreg.export.cameras import Orbit, orbit_of_box, orbit_of_views
+from gridreg.export.decimation import decimate
+from gridreg.export.html import data_uri, encode, open_image, page_environment, spread_views, target_beside
+from gridreg.export.line_chart import Series, line_chart
+from gridreg.export.mesh import Mesh, read_mesh
+from gridreg.scenes import Scene, Views, World
+from gridreg.training.curves import History
+from gridreg.training.files import write_bytes
+
+__all__ = ["write_page"]
+
+FACES = 60_000
+"""Of the mesh in the page, at most: about a megabyte."""
+
+VIDEO_BYTES = 600_000
+"""A larger video stays beside the page, which has a link to it."""
+
+_PHOTOGRAPHS, _VIEWS, _THUMBNAIL = 60, 8, 160
+_UINT16 = 2**16 - 1
+
+
+def write_page(folder: str | Path, scene: Scene | None = None, *, run: str | Path | None = None) -> Path:
+    """Write ``index.html`` into the folder of a run, from what lies there; whole or not at all.
+
+    It has the mesh to turn, the training photographs at their cameras, test views beside renders, score, curve and
+    video: what of it there is.
+
+    Args:
+        folder: where it goes to, and what it is made of.
+        scene: what the run was trained on, for photographs and cameras.
+        run: folder of the run, for what ``folder`` does not have; None: the same.
+
+    Returns:
+        The path.
+
+    Raises:
+        InputError: if a file of the run cannot be read, or the place is not writable.
+    """
+    places = [Path(folder), Path(folder if run is None else run)]
+    record = _record(places)
+    mesh, reason = _mesh(places)
+    orbit = _orbit(scene, mesh)
+    photographs = [] if scene is None else _photographs(scene.train, scene.background)
+    score, note = _score(record)
+    name = record.get("scene") or (scene.name if scene is not None else Path(folder).resolve().name)
+    text = (
+        _environment()
+        .get_template("run.html")
+        .render(
+            title=name,
+            lead=_lead(record, scene),
+            object=None if mesh is None else _object(mesh, scene, orbit, len(photographs)),
+            no_object=reason,
+            photographs=photographs,
+            size="" if mesh is None else _size(mesh),
+            score=score,
+            score_note=note,
+            pairs=_pairs(places[0] / "test", record),
+            chart=_chart(places),
+            video=_video(places),
+            provenance=_provenance(record),
+        )
+    )
+    path = Path(folder) / "index.html"
+    # Names of files that are not UTF-8 hold lone surrogates, which UTF-8 cannot write.
+    write_bytes(path, text.encode("utf-8", "backslashreplace"))
+    return path
+
+
+@cache
+def _environment() -> Environment:
+    return page_environment("gridreg.export")
+
+
+def _found(places: Sequence[Path], *names: str) -> Path | None:
+    return next((place / name for place in places for name in names if (place / name).is_file()), None)
+
+
+def _record(places: Sequence[Path]) -> dict[str, Any]:
+    path = _found(places, "metrics.json")
+    if path is None:
+        return {}
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+        if isinstance(record, dict) and isinstance(record.get("mean"), dict):
+            return record
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot read the score: {error}") from error
+    raise InputError(f"{path}: found no score, expected what train or eval writes")
+
+
+def _mesh(places: Sequence[Path]) -> tuple[Mesh | None, str]:
+    """A mesh of at most `FACES`, or why there is none."""
+    path = _found(places, "mesh.ply")
+    if path is None:
+        return None, "gridreg mesh makes one, if the field has a surface"
+    mesh = read_mesh(path)
+    if len(mesh.faces) <= FACES:
+        return mesh, ""
+    vertices, faces, nearest = decimate(mesh.vertices, mesh.faces, FACES)
+    return Mesh(vertices, faces, None if mesh.colours is None else mesh.colours[nearest]), ""
+
+
+def _orbit(scene: Scene | None, mesh: Mesh | None) -> Orbit:
+    if scene is not None and len(scene.train):
+        return orbit_of_views(scene.train, scene.bounds)
+    box = np.array([[-1.0] * 3, [1.0] * 3]) if mesh is None else [mesh.vertices.min(0), mesh.vertices.max(0)]
+    return orbit_of_box(torch.from_numpy(np.asarray(box)))
+
+
+def _object(mesh: Mesh, scene: Scene | None, orbit: Orbit, photographs: int) -> dict[str, Any]:
+    """The mesh as the page's program reads it: 16 bits a coordinate between two corners, 8 a colour."""
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    places = np.round((mesh.vertices - low) / np.maximum(high - low, 1e-12) * _UINT16)
+    colours = np.full_like(places, 150) if mesh.colours is None else mesh.colours
+    wide = len(mesh.vertices) > _UINT16
+    # Between the cameras, not behind the first, whose photograph would stand in the way.
+    pose = orbit.pose(25.0).double().numpy()
+    return {
+        "low": low.tolist(),
+        "high": high.tolist(),
+        "places": _base64(places, "<u2"),
+        "colours": _base64(colours, "u1"),
+        "faces": _base64(mesh.faces, "<u4" if wide else "<u2"),
+        "wide": wide,
+        "up": orbit.up.tolist(),
+        "front": pose[:3, 2].tolist(),
+        "cameras": [] if scene is None else _cameras(scene.train, scene.world)[:photographs],
+    }
+
+
+def _base64(values: NDArray[Any], kind: str) -> str:
+    return base64.b64encode(np.ascontiguousarray(values, dtype=kind).tobytes()).decode()
+
+
+def _chosen(views: Views) -> list[int]:
+    count = min(_PHOTOGRAPHS, len(views))
+    return [int(i) for i in np.linspace(0, len(views) - 1, count).round()] if count else []
+
+
+def _cameras(views: Views, world: World) -> list[dict[str, Any]]:
+    """Pose (three rows of four) in the world of the files, and where the image ends at distance 1: left, right, below,
+    above."""
+    found = []
+    for i in _chosen(views):
+        pose = views.poses[i].double().cpu().numpy()
+        pose[:3, 3] = world.outward(pose[:3, 3])
+        fx, fy, cx, cy = views.intrinsics[i].tolist()
+        edges = [-cx / fx, (views.width - cx) / fx, (cy - views.height) / fy, cy / fy]
+        found.append({"pose": np.round(pose[:3], 6).flatten().tolist(), "edges": edges})
+    return found
+
+
+def _photographs(views: Views, background: torch.Tensor) -> list[tuple[str, str]]:
+    """Names and small images of the views, in the order of `_cameras`."""
+    chosen = _chosen(views)
+    found = []
+    for i in chosen:
+        alpha = views.rgba[i, ..., 3:]
+        image = views.rgba[i, ..., :3] * alpha + background * (1 - alpha)
+        small = Image.fromarray((image * 255).round().to(torch.uint8).cpu().numpy())
+        small.thumbnail((_THUMBNAIL, _THUMBNAIL))
+        found.append((views.names[i], data_uri(small, "jpeg")))
+    return found
+
+
+def _lead(record: Mapping[str, Any], scene: Scene | None) -> str:
+    count = len(record.get("train_views") or ()) or (len(scene.train) if scene is not None else 0)
+    return f"Made of {count} photographs by gridreg." if count else "Made by gridreg."
+
+
+def _size(mesh: Mesh) -> str:
+    x, y, z = (float(v) for v in np.ptp(mesh.vertices, axis=0))
+    return f"{x:.4g} x {y:.4g} x {z:.4g} units of the scene's files, whose length in metres is not known."
+
+
+def _score(record: Mapping[str, Any]) -> tuple[list[tuple[str, str]], str]:
+    if not record:
+        return [], ""
+    mean = {name: float(value) for name, value in record["mean"].items()}
+    shown = [("PSNR", f"{mean.pop('psnr'):.2f} dB")] if "psnr" in mean else []
+    shown += [("SSIM" if name == "ssim_gaussian" else name, f"{value:.4f}") for name, value in mean.items()]
+    views, protocol = record.get("test_views"), record.get("protocol")
+    return shown, f"Mean of {views} views that were not trained on, protocol {protocol}."
+
+
+def _pairs(folder: Path, record: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Test views: photograph and render, and PSNR."""
+    images = record.get("images") or {}
+    found = []
+    for name in spread_views(images, _VIEWS):
+        render = open_image(folder / f"{name}.png")
+        if render is None:
+            continue
+        target = target_beside(folder / f"{name}_compare.png", render)
+        both = [("photograph", target), ("render", render)]
+        psnr = float(images[name].get("psnr", "nan"))
+        found.append(
+            {
+                "name": name,
+                "psnr": "" if math.isnan(psnr) else f"{psnr:.2f} dB",
+                "images": [(label, encode(image)) for label, image in both if image is not None],
+            }
+        )
+    return found
+
+
+def _chart(places: Sequence[Path]) -> Markup:
+    path = _found(places, "history.jsonl")
+    if path is None:
+        return Markup("")
+    rows = History.load(path).rows
+    series = []
+    for name, label, style in (
+        ("psnr", "training batches", (1, 0)),
+        ("test_psnr", "test views", (2, 0)),
+        ("validation_psnr", "validation views", (3, 0)),
+    ):
+        points = [
+            (float(row["step"]), float(row[name])) for row in rows if math.isfinite(row.get(name, math.nan))
+        ]
+        series.append(Series(label, style, points))
+    return line_chart("Training", series, x_label="iteration", y_label="PSNR (dB)", y_span=30.0)
+
+
+def _video(places: Sequence[Path]) -> dict[str, str] | None:
+    path = _found(places, "turntable.mp4", "spiral.mp4")
+    if path is None:
+        return None
+    content = path.read_bytes() if path.stat().st_size <= VIDEO_BYTES else b""
+    src = "data:video/mp4;base64," + base64.b64encode(content).decode() if content else ""
+    # A link leads to a file beside the page, no further.
+    return {"name": path.name, "src": src} if src or path.parent == places[0] else None
+
+
+def _provenance(record: Mapping[str, Any]) -> list[tuple[str, str]]:
+    if not record:
+        return []
+    versions = record.get("versions") or {}
+    entries = [
+        ("command", " ".join(map(str, record.get("command") or ()))),
+        ("iterations, seed", f"{record.get('steps')}, {record.get('seed')}"),
+        (
+            "seconds",
+            ", ".join(f"{name} {value:.0f}" for name, value in (record.get("seconds") or {}).items()),
+        ),
+        ("versions", ", ".join(f"{name} {version}" for name, version in versions.items())),
+        *(record.get("conventions") or {}).items(),
+    ]
+    return [(name, text) for name, text in entries if text]
