@@ -98,12 +98,16 @@ class Scenes:
             folder, size = builtin_scene(self._cache, size=spec.size or 200), None
         else:
             folder, size = locate_scene(spec.scene), spec.size
-        return load_scene(folder, spec.protocol, size=size, test=spec.test)
+        return load_scene(folder, spec.protocol, size=size, test=spec.test, opaque=_is_opaque(spec))
 
 
 def scene_key(spec: RunSpec) -> tuple[Any, ...]:
     """All that tells two opened scenes apart."""
-    return (spec.scene, spec.protocol, spec.size, spec.test)
+    return (spec.scene, spec.protocol, spec.size, spec.test, _is_opaque(spec))
+
+
+def _is_opaque(spec: RunSpec) -> bool:
+    return bool(spec.config.get("opaque", False))
 
 
 def locate_scene(path: str) -> Path:

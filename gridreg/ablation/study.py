@@ -44,7 +44,7 @@ from gridreg.training.run import regularizers_of
 from gridreg.training.settings import RunConfig
 from gridreg.training.strict_yaml import parse_yaml
 
-__all__ = ["BUILTIN_FRAMES", "DATA_VARIABLE", "import_modules", "load_study", "study_from_text"]
+__all__ = ["BUILTIN_FRAMES", "DATA_VARIABLE", "check_fits", "import_modules", "load_study", "study_from_text"]
 
 DATA_VARIABLE = "GRIDREG_DATA"
 BUILTIN_FRAMES = 18
@@ -128,7 +128,7 @@ def _runs(file: StudyFile, rows: Sequence[Row], scenes: Sequence[Path | None]) -
                 fit = str((config.backbone, config.field, config.composition))
                 if fit not in fitting:
                     fitting.add(fit)
-                    _check_fits(label, config)
+                    check_fits(label, config)
                 runs += _row_runs(file, label, config, scenes)
     unique = {(run.label, run.hash): run for run in runs}
     return list(unique.values())
@@ -158,8 +158,12 @@ def _row_runs(file: StudyFile, label: str, config: RunConfig, scenes: Sequence[P
     return runs
 
 
-def _check_fits(label: str, config: RunConfig) -> None:
-    """Attach the composition to a small field of this configuration, before hours of runs depend on it."""
+def check_fits(label: str, config: RunConfig) -> None:
+    """Attach the composition to a small field of this configuration, before hours of runs depend on it.
+
+    Raises:
+        ConfigError: with the name of the row, if it cannot be attached.
+    """
     bounds, generator = torch.tensor([[-1.0] * 3, [1.0] * 3]), torch.Generator().manual_seed(0)
     try:
         field = make_field(config.backbone, bounds, (_EDGE,) * 3, generator=generator, **config.field)

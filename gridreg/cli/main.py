@@ -56,6 +56,11 @@ COMMANDS: dict[str, Command] = {
         "gridreg.ablation.command:AblationOptions",
         "gridreg.ablation.command:run",
     ),
+    "tune": Command(
+        "choose strengths of regularizers by the training views of a scene",
+        "gridreg.ablation.tune:TuneOptions",
+        "gridreg.ablation.tune:run",
+    ),
     "report": Command(
         "make the report of a table of anybody's results",
         "gridreg.ablation.table_report:ReportOptions",

@@ -23,7 +23,14 @@ from gridreg.scenes.reader import OpenedFrames, ViewReader
 from gridreg.scenes.transforms import read_transforms
 from gridreg.scenes.views import IN_PLACE, Scene, Views, World, background_colour
 
-__all__ = ["BUILTIN_MARKER", "NotASceneError", "default_protocol", "load_scene", "read_folder"]
+__all__ = [
+    "BUILTIN_MARKER",
+    "NotASceneError",
+    "default_protocol",
+    "load_scene",
+    "read_folder",
+    "training_views",
+]
 
 BUILTIN_MARKER = "builtin.json"
 """File that marks a folder as the built-in scene."""
@@ -70,7 +77,12 @@ def load_scene(
     by = f"protocol {protocol.name}"
     train_ids = _checked(_selected(protocol.train, files.train), files, "train", by)
     scored = files.test
-    if test is None and protocol.validates:
+    left_out: tuple[int, ...] = ()
+    if protocol.leave is not None:
+        train_ids, left_out = _without(protocol.leave, train_ids, by)
+    if test is None and left_out:
+        scored, test_ids = files.train, left_out
+    elif test is None and protocol.validates:
         scored, test_ids = files.train, _free_ids(VALIDATION_VIEWS, train_ids, files, by)
     elif test is None and files.split_here:
         # The held-out frames are the test views; a protocol's rule would thin them out a second time.
@@ -133,6 +145,17 @@ def default_protocol(folder: str | Path) -> str:
         return "holdout8"
     wanted = get_protocol("dietnerf8").train.select(np.zeros((len(files.train), 3)))
     return "dietnerf8" if max(wanted) < len(files.train) else f"first{len(files.train)}"
+
+
+def training_views(folder: str | Path, protocol: str) -> int:
+    """Return how many views of a scene a protocol trains on, without opening an image.
+
+    Raises:
+        InputError: for an unknown protocol, or lists of frames that cannot be read or do not hold its views.
+    """
+    files = read_folder(Path(folder))
+    ids = _selected(get_protocol(protocol).train, files.train)
+    return len(_checked(ids, files, "train", f"protocol {protocol}"))
 
 
 class NotASceneError(InputError):
@@ -218,6 +241,13 @@ def _doubts(world: World, train: Views, test: Views) -> list[str]:
                 "a high score on them means nothing"
             )
     return notes
+
+
+def _without(position: int, ids: tuple[int, ...], by: str) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Training views without the one at a position, and that one."""
+    if not position < len(ids) > 1:
+        raise InputError(f"{by}: found {len(ids)} training views, expected at least {max(2, position + 1)}")
+    return ids[:position] + ids[position + 1 :], (ids[position],)
 
 
 def _checked(ids: tuple[int, ...], files: SceneFiles, split: str, by: str) -> tuple[int, ...]:

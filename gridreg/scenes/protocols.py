@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridreg.errors import ConfigError
+from gridreg.scenes.kmeans import greedy_plus_plus, lloyd, squared_distances
 
 __all__ = [
     "PROTOCOLS",
@@ -105,12 +106,12 @@ class KMeans:
         rng = np.random.default_rng(self.seed)
         centres = positions[[int(rng.integers(len(positions)))]]
         while len(centres) < self.count:
-            gap = _squared_distances(positions, centres).min(axis=1)
+            gap = squared_distances(positions, centres).min(axis=1)
             # Cameras at one place leave nothing to spread over: any of them is as good.
             fraction = gap / gap.sum() if gap.sum() > 0 else np.full(len(gap), 1 / len(gap))
             centres = np.concatenate([centres, positions[[int(rng.choice(len(positions), p=fraction))]]])
         for _ in range(100):
-            nearest = _squared_distances(positions, centres).argmin(axis=1)
+            nearest = squared_distances(positions, centres).argmin(axis=1)
             moved = np.stack(
                 [
                     positions[nearest == k].mean(axis=0) if (nearest == k).any() else c
@@ -120,7 +121,7 @@ class KMeans:
             if np.array_equal(moved, centres):
                 break
             centres = moved
-        distances = _squared_distances(positions, centres)
+        distances = squared_distances(positions, centres)
         chosen: list[int] = []
         for k in range(self.count):
             distances[chosen, k] = np.inf
@@ -149,50 +150,14 @@ class NearestToCentres:
         middle = positions.mean(axis=0)
         points = positions - middle
         random = np.random.RandomState(0)
-        runs = [_lloyd(points, _greedy_plus_plus(points, self.count, random)) for _ in range(self.restarts)]
+        runs = [lloyd(points, greedy_plus_plus(points, self.count, random)) for _ in range(self.restarts)]
         _, centres = min(runs, key=lambda run: run[0])
         # In the world, as the program has it: of two cameras that share a centre, rounding decides.
         distances = np.linalg.norm(positions[:, None] - (centres + middle), axis=-1)
         return tuple(sorted(int(i) for i in distances.argmin(axis=0)))
 
 
-def _greedy_plus_plus(
-    points: NDArray[np.float64], count: int, random: np.random.RandomState
-) -> NDArray[np.float64]:
-    """Draw ``(count, 3)`` starting centres: each the best of some candidates by what is left of the
-    distances."""
-    chosen = [int(random.choice(len(points), p=np.full(len(points), 1 / len(points))))]
-    gap = _squared_distances(points, points[chosen])[:, 0]
-    while len(chosen) < count:
-        drawn = random.uniform(size=2 + int(np.log(count))) * gap.sum()
-        candidates = np.minimum(np.searchsorted(np.cumsum(gap), drawn), len(points) - 1)
-        left = np.minimum(gap, _squared_distances(points[candidates], points))
-        best = int(left.sum(axis=1).argmin())
-        gap = left[best]
-        chosen.append(int(candidates[best]))
-    return points[chosen]
-
-
-def _lloyd(points: NDArray[np.float64], centres: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
-    """Return the inertia and the centres where the clusters, or nearly the centres, no longer change."""
-    tolerance = 1e-4 * float(points.var(axis=0).mean())
-    before = np.full(len(points), -1)
-    for _ in range(300):
-        nearest = _squared_distances(points, centres).argmin(axis=1)
-        members = [points[nearest == k] for k in range(len(centres))]
-        moved = np.stack([m.mean(axis=0) if len(m) else c for m, c in zip(members, centres, strict=True)])
-        shift, centres = float(((moved - centres) ** 2).sum()), moved
-        if np.array_equal(nearest, before) or shift <= tolerance:
-            break
-        before = nearest
-    return float(_squared_distances(points, centres).min(axis=1).sum()), centres
-
-
 Selection = Listed | Every | First | Seeded | Spread | KMeans | NearestToCentres
-
-
-def _squared_distances(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray(((a[:, None] - b[None]) ** 2).sum(axis=-1))
 
 
 @dataclass(frozen=True)
@@ -207,8 +172,8 @@ class Protocol:
         background: ``"white"`` or ``"black"``.
         source: who uses it.
         validates: the scored views are `VALIDATION_VIEWS` training frames, evenly spread over those that are
-            not
-            trained on, instead of ``test``.
+            not trained on, instead of ``test``.
+        leave: position among the training views of the one that is left out and scored instead of ``test``.
     """
 
     name: str
@@ -218,6 +183,7 @@ class Protocol:
     background: str
     source: str
     validates: bool = False
+    leave: int | None = None
 
 
 VALIDATION_VIEWS = 10
@@ -260,7 +226,8 @@ def get_protocol(name: str) -> Protocol:
     SplatFields as scikit-learn finds them today (one start), and ``splatfields<N>-ninit10`` as it did by
     default when that was published (ten starts), both on all test views as stored. Any of them followed by
     ``-validation``, such as ``dietnerf8-validation``, trains on the same views and scores training frames
-    outside them: for choosing settings without a look at the test views.
+    outside them: for choosing settings without a look at the test views. And any followed by ``-leave<K>``
+    trains on all of its views but the K-th, from 0, and scores that one: `gridreg tune` chooses so.
 
     Raises:
         InputError: for an unknown name.
@@ -271,14 +238,21 @@ def get_protocol(name: str) -> Protocol:
     if name in PROTOCOLS:
         return PROTOCOLS[name]
     if name.endswith(_SUFFIX) and not name.removesuffix(_SUFFIX).endswith(_SUFFIX):
-        return replace(get_protocol(name.removesuffix(_SUFFIX)), name=name, validates=True)
+        whole = get_protocol(name.removesuffix(_SUFFIX))
+        if whole.leave is None:
+            return replace(whole, name=name, validates=True)
+    left_out = re.fullmatch(r"(.+)-leave(\d{1,6})", name)
+    if left_out is not None:
+        whole = get_protocol(left_out[1])
+        if not whole.validates and whole.leave is None:
+            return replace(whole, name=name, leave=int(left_out[2]))
     counted = re.fullmatch(r"(views|first|spread|human|splatfields)([1-9]\d{0,5})(-ninit10)?", name)
     if counted is None or (counted[3] and counted[1] != "splatfields"):
         known = ", ".join(PROTOCOLS)
         raise ConfigError(
             ("protocol",),
             f"found {name!r}, expected one of {known}, views<N>, first<N>, spread<N>, human<N>, splatfields<N>, "
-            "splatfields<N>-ninit10, or one of these with -validation",
+            "splatfields<N>-ninit10, or one of these with -validation or -leave<K>",
         )
     count = int(counted[2])
     if counted[1] == "spread":
