@@ -38,6 +38,7 @@ def _own(about: str, module: str, options: str) -> Command:
 
 
 COMMANDS: dict[str, Command] = {
+    "board": _own("draw the sheet to print and to photograph an object on", "board", "BoardOptions"),
     "prepare": _own("turn a folder of images into a scene", "prepare", "PrepareOptions"),
     "train": Command(
         "reconstruct a scene, score it, and write a mesh and a video",

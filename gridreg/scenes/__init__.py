@@ -5,9 +5,11 @@ from __future__ import annotations
 from gridreg.scenes.builtin import (
     builtin_depth,
     builtin_mesh,
+    builtin_photographs,
     builtin_scene,
     builtin_signed_distance,
     builtin_surface,
+    photograph_mesh,
 )
 from gridreg.scenes.llff import ndc_rays
 from gridreg.scenes.load import default_protocol, load_scene
@@ -26,6 +28,7 @@ __all__ = [
     "background_colour",
     "builtin_depth",
     "builtin_mesh",
+    "builtin_photographs",
     "builtin_scene",
     "builtin_signed_distance",
     "builtin_surface",
@@ -33,5 +36,6 @@ __all__ = [
     "get_protocol",
     "load_scene",
     "ndc_rays",
+    "photograph_mesh",
     "prepare",
 ]

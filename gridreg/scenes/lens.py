@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from gridreg.errors import InputError
 
-__all__ = ["NO_DISTORTION", "LensDistortion", "undistort"]
+__all__ = ["NO_DISTORTION", "LensDistortion", "sample_bilinear", "undistort"]
 
 Array = NDArray[np.float64]
 _STRONGEST_ZOOM = 4.0
@@ -81,7 +81,7 @@ def undistort(
     columns, rows = _source(_centres(width), _centres(height)[:, None], pinhole, intrinsics, distortion)
     # Weighted by alpha: the colour behind transparent pixels must not bleed into the others.
     premultiplied = np.concatenate([image[..., :3] * image[..., 3:], image[..., 3:]], axis=-1)
-    sampled = _bilinear(premultiplied, columns, rows)
+    sampled = sample_bilinear(premultiplied, columns, rows)
     colours = sampled[..., :3] / np.maximum(sampled[..., 3:], 1e-6)
     return np.concatenate([colours, sampled[..., 3:]], axis=-1), pinhole
 
@@ -127,7 +127,7 @@ def _least_zoom(intrinsics: Array, distortion: LensDistortion, width: int, heigh
     return high
 
 
-def _bilinear(image: NDArray[np.float32], columns: Array, rows: Array) -> NDArray[np.float32]:
+def sample_bilinear(image: NDArray[np.float32], columns: Array, rows: Array) -> NDArray[np.float32]:
     """Sample ``(H, W, C)`` at pixel coordinates whose pixel centres are at + 0.5, clamped to the border."""
     height, width = image.shape[:2]
     x = np.clip(columns - 0.5, 0, width - 1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -11,7 +12,7 @@ from gridreg.scenes.builtin.lighthouse import Part, lighthouse
 from gridreg.scenes.builtin.materials import shade
 from gridreg.scenes.builtin.solids import rotate
 
-__all__ = ["Hits", "cast", "render_rgba"]
+__all__ = ["Hits", "cast", "hit_colours", "render_rgba"]
 
 Array = NDArray[np.float64]
 
@@ -36,7 +37,9 @@ class Hits(NamedTuple):
         return np.asarray(self.parameter * np.sqrt(1 + self.right**2 + self.down[:, None] ** 2))
 
 
-def cast(pose: Array, intrinsics: Array, columns: Array, rows: Array) -> Hits:
+def cast(
+    pose: Array, intrinsics: Array, columns: Array, rows: Array, parts: Sequence[Part] | None = None
+) -> Hits:
     """Cast the rays through pixel coordinates ``columns`` x ``rows`` (a pixel's centre is at + 0.5).
 
     Args:
@@ -44,13 +47,14 @@ def cast(pose: Array, intrinsics: Array, columns: Array, rows: Array) -> Hits:
         intrinsics: ``(4,)`` fx, fy, cx, cy in pixels.
         columns: ``(w,)`` increasing.
         rows: ``(h,)`` increasing.
+        parts: what there is to hit; None: the lighthouse.
     """
     fx, fy, cx, cy = intrinsics
     right = (columns - cx) / fx
     down = (rows - cy) / fy
     parameter = np.full((len(rows), len(columns)), np.inf)
     part_hit = np.full(parameter.shape, -1, dtype=np.int16)
-    for number, part in enumerate(lighthouse()):
+    for number, part in enumerate(lighthouse() if parts is None else parts):
         window = _window(part, pose, right, down)
         if window is None:
             continue
@@ -94,21 +98,8 @@ def render_rgba(pose: Array, intrinsics: Array, width: int, height: int, *, samp
     columns = (np.arange(width * samples) + 0.5) / samples
     rows = (np.arange(height * samples) + 0.5) / samples
     hits = cast(pose, intrinsics, columns, rows)
-    found = np.flatnonzero(hits.part >= 0)
-    found = found[np.argsort(hits.part.ravel()[found], kind="stable")]
+    found, colour = hit_colours(hits, pose, lighthouse())
     row, column = np.divmod(found, width * samples)
-    slopes = np.stack([hits.right[column], -hits.down[row], -np.ones(len(found))], axis=-1)
-    rays = rotate(slopes, pose[:3, :3].T)
-    points = pose[:3, 3] + hits.parameter.ravel()[found, None] * rays
-    to_camera = -rays / np.linalg.norm(rays, axis=-1, keepdims=True)
-    colour = np.empty((len(found), 3))
-    parts = lighthouse()
-    starts = np.searchsorted(hits.part.ravel()[found], np.arange(len(parts) + 1))
-    for number, part in enumerate(parts):
-        of_part = slice(starts[number], starts[number + 1])
-        local = part.local(points[of_part])
-        normals = rotate(part.solid.normal(local), part.axes.T)
-        colour[of_part] = shade(part.material, local, normals, to_camera[of_part])
     pixel = (row // samples) * width + column // samples
     covered = np.bincount(pixel, minlength=width * height)
     channels = [
@@ -116,3 +107,22 @@ def render_rgba(pose: Array, intrinsics: Array, width: int, height: int, *, samp
         for c in range(3)
     ]
     return np.stack([*channels, covered / samples**2], axis=-1).reshape(height, width, 4)
+
+
+def hit_colours(hits: Hits, pose: Array, parts: Sequence[Part]) -> tuple[NDArray[np.int64], Array]:
+    """Return the flat indices of rays that hit something, and their ``(N, 3)`` colours in [0, 1]."""
+    found = np.flatnonzero(hits.part >= 0)
+    found = found[np.argsort(hits.part.ravel()[found], kind="stable")]
+    row, column = np.divmod(found, hits.part.shape[1])
+    slopes = np.stack([hits.right[column], -hits.down[row], -np.ones(len(found))], axis=-1)
+    rays = rotate(slopes, pose[:3, :3].T)
+    points = pose[:3, 3] + hits.parameter.ravel()[found, None] * rays
+    to_camera = -rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+    colour = np.empty((len(found), 3))
+    starts = np.searchsorted(hits.part.ravel()[found], np.arange(len(parts) + 1))
+    for number, part in enumerate(parts):
+        of_part = slice(starts[number], starts[number + 1])
+        local = part.local(points[of_part])
+        normals = rotate(part.solid.normal(local), part.axes.T)
+        colour[of_part] = shade(part.material, local, normals, to_camera[of_part])
+    return found, colour

@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import tempfile
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from gridreg.scenes.builtin.cameras import FIELD_OF_VIEW, test_poses, train_pose
 from gridreg.scenes.builtin.raycast import cast, render_rgba
 from gridreg.scenes.load import BUILTIN_MARKER
 
-__all__ = ["builtin_depth", "builtin_scene"]
+__all__ = ["builtin_depth", "builtin_scene", "write_once"]
 
 Array = NDArray[np.float64]
 
@@ -48,7 +49,26 @@ def builtin_scene(folder: str | Path, *, size: int = 200) -> Path:
     if size < 8:
         raise InputError(f"size: found {size}, expected at least 8 pixels")
     target = Path(folder) / f"lighthouse_{size}"
-    if _is_complete(target, size):
+    needed = [f"{split}/r_{k}.png" for split, poses in _lists().items() for k in range(len(poses))]
+    needed += [f"transforms_{split}.json" for split in _lists()]
+    return write_once(target, _marker(size), needed, lambda fresh: _write(fresh, size))
+
+
+def write_once(
+    target: Path, marker: dict[str, object], needed: list[str], write: Callable[[Path], None]
+) -> Path:
+    """Write a folder whole or not at all, unless it is there already, and return it.
+
+    Args:
+        target: the folder.
+        marker: what its `BUILTIN_MARKER` says; another one is written anew.
+        needed: files without which it is not complete.
+        write: makes and fills the folder that it is given.
+
+    Raises:
+        InputError: when the folder cannot be written, or something else is in its place.
+    """
+    if _is_complete(target, marker, needed):
         return target
     if target.exists() and not (target / BUILTIN_MARKER).is_file():
         raise InputError(
@@ -56,16 +76,17 @@ def builtin_scene(folder: str | Path, *, size: int = 200) -> Path:
         )
     scratch: str | None = None
     try:
-        Path(folder).mkdir(parents=True, exist_ok=True)
-        scratch = tempfile.mkdtemp(prefix=f".{target.name}.", dir=folder)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        scratch = tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent)
         fresh = Path(scratch) / "scene"
-        _write(fresh, size)
+        write(fresh)
+        _write_json(fresh / BUILTIN_MARKER, marker)
         if target.exists():
             target.rename(Path(scratch) / "old")
         fresh.rename(target)
     except OSError as error:
         # Another process may have finished the same scene in the meantime.
-        if not _is_complete(target, size):
+        if not _is_complete(target, marker, needed):
             raise InputError(f"{target}: the built-in scene cannot be written ({error.strerror})") from None
     finally:
         if scratch is not None:
@@ -106,14 +127,12 @@ def _marker(size: int) -> dict[str, object]:
     }
 
 
-def _is_complete(target: Path, size: int) -> bool:
+def _is_complete(target: Path, marker: dict[str, object], needed: list[str]) -> bool:
     try:
-        marker = json.loads((target / BUILTIN_MARKER).read_text(encoding="utf-8"))
+        found = json.loads((target / BUILTIN_MARKER).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return False
-    needed = [target / split / f"r_{k}.png" for split, poses in _lists().items() for k in range(len(poses))]
-    needed += [target / f"transforms_{split}.json" for split in _lists()]
-    return bool(marker == _marker(size)) and all(path.is_file() for path in needed)
+    return bool(found == marker) and all((target / name).is_file() for name in needed)
 
 
 def _write(folder: Path, size: int) -> None:
@@ -140,7 +159,6 @@ def _write(folder: Path, size: int) -> None:
             )
         for view in views:
             view.result()
-    _write_json(folder / BUILTIN_MARKER, _marker(size))
 
 
 def _write_json(path: Path, content: dict[str, object]) -> None:
