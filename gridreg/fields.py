@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import importlib
+import importlib.util
 import math
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Sequence
 from importlib.metadata import entry_points
+from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 from torch import nn
 
 from gridreg.errors import ConfigError, InputError, near_names
 
-__all__ = ["field_names", "make_field", "register_field"]
+__all__ = ["field_names", "import_modules", "make_field", "register_field"]
 
 _registered: dict[str, Callable[..., nn.Module]] = {}
 
@@ -54,6 +58,36 @@ def make_field(name: str, *arguments: Any, **options: Any) -> nn.Module:
         return constructor(*arguments, **options)
     except (TypeError, ValueError, RuntimeError, ArithmeticError, MemoryError) as error:
         raise InputError(f"backbone {name!r}: {error}") from error
+
+
+def import_modules(
+    names: Sequence[str], source: str = "", *, beside: Path | None = None, never: Path | None = None
+) -> None:
+    """Import the modules that register fields, regularizers and compositions of one's own.
+
+    They are found where Python finds modules, and after that beside a file and in the current folder.
+
+    Args:
+        names: of the modules.
+        source: names what asks for them, in errors.
+        beside: the folder of that file.
+        never: a folder that may be of somebody else's, such as a run's: no module in it is imported.
+
+    Raises:
+        ConfigError: if one cannot be imported.
+    """
+    places = [str(place.resolve()) for place in (beside, Path()) if place is not None] if names else []
+    sys.path += [place for place in dict.fromkeys(places) if place not in sys.path]
+    for name in names:
+        try:
+            found = None if name in sys.modules else importlib.util.find_spec(name.partition(".")[0])
+            origins = [] if found is None else [found.origin or "", *(found.submodule_search_locations or ())]
+            if never is not None and any(Path(o).resolve().is_relative_to(never.resolve()) for o in origins):
+                raise ImportError(f"it lies in {never}, whose code is not run; expected it elsewhere")
+            importlib.import_module(name)
+        # A module of somebody's may fail in any way, and so does the search for a strange name.
+        except Exception as error:
+            raise ConfigError(("modules",), f"cannot import {name!r}: {error}", source) from error
 
 
 _KINDS = {int: "an integer", float: "a finite number", bool: "true or false", str: "text"}

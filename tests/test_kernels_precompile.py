@@ -102,3 +102,17 @@ def test_a_damaged_cache_is_made_anew(tmp_path, kind, left):
     assert in_fresh_cache(tmp_path, told, **quiet) == before
     assert in_fresh_cache(tmp_path, told.replace("== 1", "== 0"), **quiet) == before
     assert all(file.stat().st_size > left for file in tmp_path.glob(f"*/*.{kind}"))
+
+
+def test_a_kernel_is_told_of_where_it_is_compiled_and_its_time_is_known(tmp_path):
+    use = """
+        from gridreg.ops import compilation
+        from gridreg.ops.cpu import reductions
+        told = []
+        with compilation.telling_compilation(told.append):
+            reductions._round.address, reductions._round.address
+        assert told == {expected}, told
+        assert 0 < compilation.compile_seconds() < 60
+        """
+    for expected in ([0, None], []):  # compiled, then read from the cache
+        in_fresh_cache(tmp_path, use.format(expected=expected), GRIDREG_COMPILE_AHEAD="0")

@@ -14,7 +14,8 @@ import time
 
 import pytest
 
-from gridreg.training.progress import Interruption, Progress, clock_time, interruptible
+from gridreg.ops import compilation
+from gridreg.training.progress import Interruption, Progress, clock_time, compilation_shown, interruptible
 
 
 class Clock:
@@ -162,6 +163,42 @@ def test_an_update_costs_microseconds():
     for step in range(1000):
         progress.update(step, psnr=1.0, loss=1.0)
     assert time.perf_counter() - begun < 0.2
+
+
+def test_compiling_is_shown_with_a_bar_and_leaves_the_line(terminal):
+    with compilation_shown(terminal):
+        with compilation.timed(), compilation.compiling():
+            pass
+        with compilation.timed():  # out of the cache: not a word
+            pass
+    before, first, last = terminal.getvalue().split("\r\x1b[K")
+    assert before == ""
+    assert re.fullmatch(r"compiling kernels \(once, about \d+ s\) \[#* *\]", first)
+    assert last == ""
+
+
+def test_a_log_is_told_of_compiling_once():
+    log = io.StringIO()
+    with compilation_shown(log):
+        for _ in range(3):
+            with compilation.timed(), compilation.compiling():
+                pass
+    assert re.fullmatch(r"compiling kernels \(once, about \d+ s\)\n", log.getvalue())
+
+
+def test_the_clock_stands_still_while_kernels_are_compiled():
+    """Or the first line of a first run says "left 9:29:22"."""
+    log = io.StringIO()
+    with Progress(1000, stream=log, seconds=0) as progress:
+        with compilation.timed():
+            time.sleep(0.5)
+        progress.update(1)
+    before, spent = compilation.work_clock(), compilation.compile_seconds()
+    with compilation.timed():
+        time.sleep(0.05)
+    assert compilation.compile_seconds() - spent >= 0.05
+    assert compilation.work_clock() - before < 0.04
+    assert float(re.search(r"([\d.]+) it/s", log.getvalue())[1]) > 5
 
 
 def test_clock_time():

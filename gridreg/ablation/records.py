@@ -70,11 +70,13 @@ class RunSpec:
         """16 hexadecimal digits of everything that determines the result.
 
         The scene goes in by its name, because it may lie elsewhere on another machine; the store compares the
-        fingerprints of what was trained on. Names of row and preset, and how often a checkpoint is written, stay
-        out: they change nothing. So does the number of threads, which is recorded with the result, and settings that
-        did not exist when stores were first written, at the values that leave a run as it was.
+        fingerprints of what was trained on. Names of row, preset and modules, and how often a checkpoint is written,
+        stay out: they change nothing. So does the number of threads, which is recorded with the result, and settings
+        that did not exist when stores were first written, at the values that leave a run as it was.
         """
-        config = {key: value for key, value in self.config.items() if key not in ("scene", "preset")}
+        config = {
+            key: value for key, value in self.config.items() if key not in ("scene", "preset", "modules")
+        }
         if isinstance(config.get("train"), dict):
             config["train"] = {
                 key: value

@@ -21,7 +21,6 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib
 import os
 import re
 from collections.abc import Sequence
@@ -34,7 +33,7 @@ from gridreg.ablation.records import RunSpec, Study
 from gridreg.ablation.rows import Row, expand_rows
 from gridreg.ablation.study_file import StudyFile
 from gridreg.errors import ConfigError
-from gridreg.fields import field_names, make_field
+from gridreg.fields import field_names, import_modules, make_field
 from gridreg.scenes.files import read_text
 from gridreg.scenes.protocols import Every, Listed, Protocol, get_protocol
 from gridreg.training.config import from_data, override, to_data
@@ -44,7 +43,7 @@ from gridreg.training.run import regularizers_of
 from gridreg.training.settings import RunConfig
 from gridreg.training.strict_yaml import parse_yaml
 
-__all__ = ["BUILTIN_FRAMES", "DATA_VARIABLE", "check_fits", "import_modules", "load_study", "study_from_text"]
+__all__ = ["BUILTIN_FRAMES", "DATA_VARIABLE", "check_fits", "load_study", "study_from_text"]
 
 DATA_VARIABLE = "GRIDREG_DATA"
 BUILTIN_FRAMES = 18
@@ -85,7 +84,7 @@ def study_from_text(
     """
     document = parse_yaml(text, source)
     file = from_data(StudyFile, document)
-    import_modules(file.modules, source)
+    import_modules(file.modules, source, beside=folder)
 
     rows: list[Row] = []
     for index, entry in enumerate(file.compositions):
@@ -140,7 +139,9 @@ def _row_runs(file: StudyFile, label: str, config: RunConfig, scenes: Sequence[P
         for protocol in _protocols(file, scene):
             for seed in file.seeds:
                 path = None if scene is None else str(scene)
-                full = dataclasses.replace(config, scene=path, protocol=protocol.name, seed=seed)
+                full = dataclasses.replace(
+                    config, scene=path, protocol=protocol.name, seed=seed, modules=tuple(file.modules)
+                )
                 runs.append(
                     RunSpec(
                         label=label,
@@ -269,17 +270,3 @@ def _baseline(file: StudyFile, labels: Sequence[str]) -> str:
             ("baseline",), f"found {file.baseline!r}, expected one of the rows {', '.join(labels)}"
         )
     return fitting[0]
-
-
-def import_modules(modules: Sequence[str], source: str) -> None:
-    """Import the modules that register what a study uses beyond gridreg's own.
-
-    Raises:
-        InputError: if one cannot be imported.
-    """
-    for module in modules:
-        try:
-            importlib.import_module(module)
-        # A module of somebody's may fail in any way, and so does the search for a strange name.
-        except Exception as error:
-            raise ConfigError(("modules",), f"cannot import {module!r}: {error}", source) from error

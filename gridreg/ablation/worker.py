@@ -38,8 +38,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from gridreg.ablation.database import DiskFullError
     from gridreg.ablation.runners import serve
     from gridreg.ablation.store import Store
-    from gridreg.ablation.study import import_modules
     from gridreg.errors import InputError
+    from gridreg.fields import import_modules
 
     try:
         torch.set_num_threads(max(1, options.threads))

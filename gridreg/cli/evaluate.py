@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import time
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -38,6 +37,7 @@ def run(options: EvalOptions) -> int:
     """
     from gridreg.cli.runs import folder_of, scene_of
     from gridreg.export import write_page
+    from gridreg.ops.compilation import work_clock
     from gridreg.training import load_run
     from gridreg.training.config import to_data
     from gridreg.training.evaluate import Scored, score_views
@@ -53,7 +53,7 @@ def run(options: EvalOptions) -> int:
     folder = None if options.out is None else check_output_folder(options.out / "test")
     if loaded.step < loaded.config.train.steps:
         print(f"step {loaded.step} of {loaded.config.train.steps}: not trained to its end", file=sys.stderr)
-    began = time.perf_counter()
+    began = work_clock()
 
     def each(view: Scored) -> None:
         values = "  ".join(f"{name} {value:.4f}" for name, value in view.metrics.items())
@@ -70,7 +70,7 @@ def run(options: EvalOptions) -> int:
         builtin=scene.builtin,
         seed=loaded.config.seed,
         steps=loaded.step,
-        seconds={"test": time.perf_counter() - began},
+        seconds={"test": work_clock() - began},
         config=to_data(loaded.config),
         command=["gridreg", *sys.argv[1:]],
         train_views=scene.train.names,

@@ -67,6 +67,7 @@ COMMANDS: dict[str, Command] = {
         "gridreg.ablation.table_report:ReportOptions",
         "gridreg.ablation.table_report:run",
     ),
+    "show": _own("list presets, compositions, protocols, regularizers and keys", "show", "ShowOptions"),
     "bench": _own("run a benchmark of a checkout", "bench", "BenchOptions"),
 }
 """The commands by name, in the order of the overview."""
@@ -102,8 +103,11 @@ def _main(words: list[str]) -> int:
         # What follows the name of a benchmark is the benchmark's own.
         return int(run(rest))
     from gridreg.cli.arguments import parse_options
+    from gridreg.training.progress import compilation_shown
 
-    return int(run(parse_options(options_of(name), rest, f"gridreg {name}")) or 0)
+    options = parse_options(options_of(name), rest, f"gridreg {name}")
+    with compilation_shown():
+        return int(run(options) or 0)
 
 
 def options_of(name: str) -> Any:

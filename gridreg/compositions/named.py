@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Literal
@@ -17,7 +18,7 @@ from gridreg.regularizers.optimizer import WeightDecay
 from gridreg.regularizers.total_variation import TotalVariation
 from gridreg.schedules import Linear, Piecewise
 
-__all__ = ["RETIRED", "composition", "composition_names", "register_composition"]
+__all__ = ["RETIRED", "composition", "composition_about", "composition_names", "register_composition"]
 
 RETIRED = {
     "few_tensorf_finetuned": "as published it is 'few_tensorf'; tuned here it is the preset of this name, "
@@ -45,6 +46,11 @@ def register_composition(name: str, make: Callable[[], list[Regularizer]]) -> Ca
 def composition_names() -> list[str]:
     """Names that `composition` accepts."""
     return sorted(_COMPOSITIONS)
+
+
+def composition_about(name: str) -> str:
+    """What a composition is: the docstring of the function that makes it."""
+    return inspect.getdoc(_COMPOSITIONS[name]) or ""
 
 
 def composition(name: str, missing: Literal["refuse", "skip"] = "refuse") -> list[Regularizer]:

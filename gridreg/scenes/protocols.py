@@ -15,6 +15,7 @@ from gridreg.errors import ConfigError
 from gridreg.scenes.kmeans import greedy_plus_plus, lloyd, squared_distances
 
 __all__ = [
+    "COUNTED",
     "PROTOCOLS",
     "VALIDATION_VIEWS",
     "Every",
@@ -214,20 +215,26 @@ PROTOCOLS: dict[str, Protocol] = {
 }
 """The protocols by name; :func:`get_protocol` knows the counted forms as well."""
 
+COUNTED = {
+    "views<N>": "N views by NumPy's seed-0 choice, else as dietnerf8",
+    "first<N>": "the first N views, else as dietnerf8",
+    "spread<N>": "N views evenly spread over the list, tested on all test views, as stored",
+    "human<N>": "N views of a body, evenly spread over 48",
+    "splatfields<N>": "the N views of SplatFields as scikit-learn finds them today",
+    "splatfields<N>-ninit10": "the N views of SplatFields as scikit-learn found them when it was published",
+    "NAME-validation": "any of these, scored on training frames that are not trained on",
+    "NAME-leave<K>": "any of these without its K-th view, scored on that one",
+}
+"""Forms of names with a number of views N, or an ending, with what they mean."""
+
 
 def get_protocol(name: str) -> Protocol:
     """Return the protocol of that name.
 
-    Besides :data:`PROTOCOLS` there are counted forms. ``views<N>`` stands for N training views by NumPy's
-    seed-0 choice and ``first<N>`` for the first N, both with size, background and test views of
-    ``dietnerf8``; ``spread<N>`` for N evenly spread over the list and all test views, as stored (RegNeRF's 3,
-    6 and 9 views of LLFF scenes; few views of any scene of which every eighth is held out); ``human<N>`` for
-    N evenly spread views of a body, of which ``human8`` is one; ``splatfields<N>`` for the views of
-    SplatFields as scikit-learn finds them today (one start), and ``splatfields<N>-ninit10`` as it did by
-    default when that was published (ten starts), both on all test views as stored. Any of them followed by
-    ``-validation``, such as ``dietnerf8-validation``, trains on the same views and scores training frames
-    outside them: for choosing settings without a look at the test views. And any followed by ``-leave<K>``
-    trains on all of its views but the K-th, from 0, and scores that one: `gridreg tune` chooses so.
+    Besides :data:`PROTOCOLS` there are the counted forms of :data:`COUNTED`. Those of a body count in the views of
+    ``human8``; ``spread<N>`` is RegNeRF's choice of 3, 6 and 9 views of LLFF scenes; SplatFields' k-means had one
+    start or, by default when it was published, ten. Settings are chosen with ``-validation``, without a look at the
+    test views; `gridreg tune` chooses with ``-leave<K>``, which trains on all views but the K-th, from 0, and scores it.
 
     Raises:
         InputError: for an unknown name.
@@ -248,12 +255,9 @@ def get_protocol(name: str) -> Protocol:
             return replace(whole, name=name, leave=int(left_out[2]))
     counted = re.fullmatch(r"(views|first|spread|human|splatfields)([1-9]\d{0,5})(-ninit10)?", name)
     if counted is None or (counted[3] and counted[1] != "splatfields"):
-        known = ", ".join(PROTOCOLS)
-        raise ConfigError(
-            ("protocol",),
-            f"found {name!r}, expected one of {known}, views<N>, first<N>, spread<N>, human<N>, splatfields<N>, "
-            "splatfields<N>-ninit10, or one of these with -validation or -leave<K>",
-        )
+        forms = [form for form in COUNTED if form[:4] != "NAME"]
+        known = f"{', '.join([*PROTOCOLS, *forms])}, or one of these with -validation or -leave<K>"
+        raise ConfigError(("protocol",), f"found {name!r}, expected one of {known}")
     count = int(counted[2])
     if counted[1] == "spread":
         return Protocol(name, Spread(count), Every(1), None, "white", "RegNeRF, on LLFF scenes")

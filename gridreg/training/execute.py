@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any, Protocol
 import torch
 
 from gridreg.errors import InputError
+from gridreg.ops.compilation import work_clock
 from gridreg.scenes import Scene
 from gridreg.training.checkpoint import has_checkpoint
 from gridreg.training.config import save_yaml, to_data
@@ -19,7 +19,7 @@ from gridreg.training.curves import History, draw_curves, draw_masks
 from gridreg.training.evaluate import Scored, mean_psnr_of, score_views
 from gridreg.training.files import check_output_folder, one_writer
 from gridreg.training.outputs import save_contact_sheet, save_scored
-from gridreg.training.progress import Interruption, Progress, interruptible
+from gridreg.training.progress import Interruption, Progress, compilation_shown, interruptible
 from gridreg.training.record import metrics_record, save_metrics
 from gridreg.training.run import build_trainer, resume_trainer, save_run
 from gridreg.training.settings import RunConfig
@@ -50,7 +50,7 @@ class Execution:
         out: its folder.
         trainer: where it stands.
         history: its curves so far.
-        seconds: by phase: ``setup``, ``train``, ``test``.
+        seconds: by phase: ``setup``, ``train``, ``test``; compiling kernels, once a machine, is left out.
     """
 
     config: RunConfig
@@ -80,7 +80,7 @@ class Execution:
     def train(self, progress: Progress, interruption: Interruption, on_step: Any = None) -> bool:
         """Train to the end of the schedule; False if it was interrupted. Saves either way, and on the way."""
         trainer, settings = self.trainer, self.config.train
-        began = saved = time.perf_counter()
+        began = saved = work_clock()
         before = self.seconds.get("train", 0.0)
         if self.scene.train.backdrop is not None:
             colour = ", ".join(f"{c:.2f}" for c in self.scene.background.tolist())
@@ -91,7 +91,7 @@ class Execution:
         def each(report: StepReport) -> bool:
             nonlocal saved
             self.history.record(trainer.step, report)
-            now = time.perf_counter()
+            now = work_clock()
             self.seconds["train"] = before + now - began
             progress.update(trainer.step, psnr=report["psnr"], loss=report["loss"])
             self._note_masks()
@@ -101,7 +101,7 @@ class Execution:
                 on_step(report)
             if now - saved > 60 * settings.checkpoint_minutes and trainer.step < settings.steps:
                 self.save()
-                saved = time.perf_counter()
+                saved = work_clock()
             return not interruption.requested
 
         try:
@@ -124,12 +124,12 @@ class Execution:
         name = "validation_psnr" if self.scene.validation is not None else "test_psnr"
         stride = max(1, len(views) // 5)
         trainer = self.trainer
-        began = time.perf_counter()
+        began = work_clock()
         trainer.field.eval()
         value = mean_psnr_of(trainer.model, views, stride)
         trainer.field.train()
         # What a look costs is not training time.
-        self.seconds["look"] = self.seconds.get("look", 0.0) + time.perf_counter() - began
+        self.seconds["look"] = self.seconds.get("look", 0.0) + work_clock() - began
         self.history.add(trainer.step, {name: value, "seconds": self.seconds["train"]})
         progress.message(f"step {trainer.step}: {name.replace('_', ' ')} {value:.2f} dB")
 
@@ -141,7 +141,7 @@ class Execution:
         """
         trainer = self.trainer
         folder = check_output_folder(self.out / "test")
-        began = time.perf_counter()
+        began = work_clock()
         trainer.handle.step(self.config.train.steps)
         trainer.field.eval()
 
@@ -155,7 +155,7 @@ class Execution:
         done: list[Scored] = []
         scored = score_views(trainer.model, self.scene.test, each)
         trainer.field.train()
-        self.seconds["test"] = time.perf_counter() - began
+        self.seconds["test"] = work_clock() - began
         return scored
 
     def record(self, scored: Sequence[Scored], command: Sequence[str]) -> dict[str, Any]:
@@ -224,13 +224,13 @@ def execute(
             died.
     """
     folder = check_output_folder(out)
-    with one_writer(folder):
+    with one_writer(folder), compilation_shown():
         checkpoint = folder / "checkpoint"
         if has_checkpoint(checkpoint) and not resume:
             raise InputError(
                 f"{folder}: holds a run already; resume it with --resume, or choose another output folder"
             )
-        began = time.perf_counter()
+        began = work_clock()
         if resume:
             trainer, record = resume_trainer(checkpoint, config, scene)
             history, times = History(), dict(record["seconds"])
@@ -241,7 +241,7 @@ def execute(
                 History(max(1, config.train.steps // 200)),
                 {},
             )
-        times["setup"] = times.get("setup", 0.0) + time.perf_counter() - began
+        times["setup"] = times.get("setup", 0.0) + work_clock() - began
         run = Execution(config, scene, folder, trainer, history, times)
         if watch is not None:
             watch.start(run)

@@ -9,7 +9,7 @@ from typing import Any
 
 import gridreg
 from gridreg.errors import InputError
-from gridreg.fields import make_field
+from gridreg.fields import import_modules, make_field
 from gridreg.rendering import Ensemble, Model, OccupancyGrid
 from gridreg.scenes import IN_PLACE, World
 from gridreg.training.checkpoint import has_checkpoint, load_checkpoint
@@ -85,7 +85,7 @@ def load_run(folder: str | Path) -> LoadedRun:
     """
     path = checkpoint_of(folder)
     members, joined, fingerprint = members_in(path)
-    runs = [_run(member["config"], member["state"], fingerprint, str(path)) for member in members]
+    runs = [_run(member["config"], member["state"], fingerprint, path) for member in members]
     return ensemble_of(runs) if joined else runs[0]
 
 
@@ -112,8 +112,10 @@ def ensemble_of(runs: Sequence[LoadedRun]) -> LoadedRun:
     )
 
 
-def _run(plain: Any, state: dict[str, Any], fingerprint: str, source: str) -> LoadedRun:
-    config = from_data(RunConfig, plain, source=source)
+def _run(plain: Any, state: dict[str, Any], fingerprint: str, path: Path) -> LoadedRun:
+    config = from_data(RunConfig, plain, source=str(path))
+    folder = path.parent if path.name == "checkpoint" else path
+    import_modules(config.modules, str(path), never=folder)
     trainer = state["trainer"]
     bounds, resolution = trainer["field"]["bounds"], tuple(trainer["resolution"]) or (128,) * 3
     field = make_field(config.backbone, bounds, resolution, **config.field)

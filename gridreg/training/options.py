@@ -11,6 +11,7 @@ import torch
 import tyro
 
 from gridreg.errors import InputError
+from gridreg.fields import import_modules
 from gridreg.training.config import assignments, from_yaml, override
 from gridreg.training.files import one_writer
 from gridreg.training.presets import load_preset, preset_names
@@ -34,19 +35,23 @@ class TrainOptions:
     scene: _Folder = None
     """Scene folder (Blender, transforms.json, COLMAP, LLFF); without one, the built-in scene."""
     protocol: _Name = None
-    """Views by name: dietnerf8 (default for Blender), holdout8 (default for one list), gs8, human8, views<N>, ..."""
+    """Views by name: dietnerf8 (default for Blender), holdout8 (default for one list), gs8, fewtensorf8, zerorf4,
+    zerorf6, human8, human50, builtin8, views<N>, first<N>, spread<N>, human<N>, splatfields<N>."""
     size: _Number = None
     """Width of the images in pixels; must divide what is stored; default: the protocol's."""
     opaque: bool = False
     """Take images without alpha as opaque, also beside others that have it."""
     preset: str = "quick"
-    """Field, schedule and regularizers by name; `paper` is few_tensorf."""
+    """Field, schedule and regularizers by name: quick, best, best-long, human, tensorf, few_tensorf, few_tensorf_10k,
+    few_tensorf_finetuned, cp, cp_quick, freenerf, freenerf_quick, fourierf, sanerf; `paper` is few_tensorf;
+    `gridreg show presets` says what each is."""
     composition: _Name = None
-    """Another named composition of regularizers on the field and schedule; default: the preset's."""
+    """Another composition of regularizers on the field and schedule: none, tensorf, few_tensorf, few_tensorf_printed,
+    few_tensorf_fixed, few_tensorf_authors, freenerf, fourierf, sanerf; default: the preset's."""
     config: _File = None
     """YAML file whose values replace the preset's, such as the config.yaml of an earlier run."""
     backbone: _Name = None
-    """Field by name: vm, cp or mlp; default: the preset's."""
+    """Field by name: vm, cp, mlp, or one of yours; default: the preset's."""
     out: _Folder = None
     """Output folder; default: outputs/SCENE-PRESET, numbered if that holds a run."""
     resume: bool = False
@@ -58,7 +63,7 @@ class TrainOptions:
     threads: _Number = None
     """Processor threads; default: all cores. Results are the same for the same number."""
     set: Annotated[tuple[str, ...], tyro.conf.arg(metavar="KEY=VALUE", help_behavior_hint="")] = ()
-    """Any other value of the configuration, such as train.rays=2048."""
+    """Any other value of the configuration, such as train.rays=2048; `gridreg show config` lists the keys."""
     mesh: bool = True
     """Write mesh.ply."""
     video: bool = True
@@ -97,6 +102,11 @@ def configure(options: TrainOptions) -> RunConfig:
         if like is not None:
             changes.setdefault("composition", like.composition)
     config = override(config, {**changes, **assignments(options.set)})
+    import_modules(
+        config.modules,
+        str(options.config or "command line"),
+        beside=None if options.config is None else options.config.parent,
+    )
     if config.scene is not None:
         # Whoever looks at the run later may stand in another folder.
         config = replace(config, scene=os.path.abspath(config.scene))

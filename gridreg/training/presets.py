@@ -8,7 +8,7 @@ from gridreg.errors import ConfigError, near_names
 from gridreg.training.config import from_yaml
 from gridreg.training.settings import RunConfig
 
-__all__ = ["load_preset", "preset_names"]
+__all__ = ["load_preset", "preset_names", "preset_text"]
 
 
 def _folder() -> Path:
@@ -20,6 +20,11 @@ def _folder() -> Path:
 def preset_names() -> list[str]:
     """Names that `load_preset` accepts."""
     return sorted(path.stem for path in _folder().glob("*.yaml"))
+
+
+def preset_text(name: str) -> str:
+    """The text of a preset's file, which begins with what it is."""
+    return (_folder() / f"{name}.yaml").read_text(encoding="utf-8")
 
 
 def load_preset(name: str) -> RunConfig:

@@ -12,14 +12,16 @@ import shutil
 import signal
 import sys
 import threading
-import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
 from typing import Any, TextIO
 
-__all__ = ["Interruption", "Progress", "clock_time", "interruptible"]
+from gridreg.machine import usable_cores
+from gridreg.ops.compilation import telling_compilation, work_clock
+
+__all__ = ["Interruption", "Progress", "clock_time", "compilation_shown", "interruptible"]
 
 _BAR = 20
 _RATE_WINDOW = 20.0
@@ -38,7 +40,7 @@ class Progress:
         label: stands before the step.
         stream: where to write; standard error by default, because standard output may be data.
         seconds: between two lines of a log; a terminal is refreshed every 0.2 s.
-        clock: seconds, ever increasing.
+        clock: seconds; stands still while kernels are compiled.
 
     Example:
         >>> with Progress(3, stream=sys.stdout, seconds=0, clock=iter([0.0, 2.0, 4.0]).__next__) as progress:
@@ -56,7 +58,7 @@ class Progress:
         label: str = "step",
         stream: TextIO | None = None,
         seconds: float = 10.0,
-        clock: Callable[[], float] = time.monotonic,
+        clock: Callable[[], float] = work_clock,
     ) -> None:
         self.total = total
         self._label = label
@@ -156,6 +158,37 @@ def clock_time(seconds: float) -> str:
 
 def _shown(name: str, value: float) -> str:
     return f"PSNR {value:.2f} dB" if name == "psnr" else f"{name} {value:.4g}"
+
+
+# Of a run with a VM field: kernels, and seconds of one core (benchmarks/speed.py compile).
+_KERNELS, _COMPILING = 29, 25
+
+
+@contextmanager
+def compilation_shown(stream: TextIO | None = None) -> Iterator[None]:
+    """A block in which a first run says that it compiles kernels: with a bar on a terminal, in a log once.
+
+    Args:
+        stream: where to write; standard error by default.
+    """
+    target = sys.stderr if stream is None else stream
+    live, said = target.isatty() and os.environ.get("TERM") != "dumb", False
+    text = f"compiling kernels (once, about {round(_COMPILING / min(2, usable_cores()))} s)"
+
+    def tell(ready: int | None) -> None:
+        nonlocal said
+        if live:
+            full = _BAR * min(ready or 0, _KERNELS) // _KERNELS
+            line = "\r\x1b[K" if ready is None else f"\r\x1b[K{text} [{'#' * full}{' ' * (_BAR - full)}]"
+        else:
+            line = "" if said or ready is None else f"{text}\n"
+        said = True
+        with contextlib.suppress(OSError, ValueError):
+            target.write(line)
+            target.flush()
+
+    with telling_compilation(tell):
+        yield
 
 
 _STOPPING = tuple(

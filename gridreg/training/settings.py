@@ -154,6 +154,7 @@ class RunConfig:
         seed: of every random number.
         size: width of the images in pixels instead of the protocol's; see `gridreg.scenes.load_scene`.
         opaque: whether images without alpha are taken as opaque beside others that have it.
+        modules: imported before the run is made, or read again: they register fields and regularizers of one's own.
     """
 
     preset: str = ""
@@ -166,3 +167,4 @@ class RunConfig:
     seed: int = 0
     size: int | None = dataclasses.field(default=None, metadata={"unset": True})
     opaque: bool = dataclasses.field(default=False, metadata={"unset": True})
+    modules: tuple[str, ...] = dataclasses.field(default=(), metadata={"unset": True})

@@ -19,6 +19,7 @@ the first run some hundredths of a second, and a slice or a new array in a kerne
 from __future__ import annotations
 
 import ast
+import contextlib
 import functools
 import inspect
 import textwrap
@@ -32,6 +33,7 @@ from numba import cfunc, njit, types
 from numba.core.caching import FunctionCache
 from numba.core.errors import NumbaWarning
 
+from gridreg.ops.compilation import compiling, timed
 from gridreg.ops.cpu.jit.cache import can_lock, discard_damaged, forget_outdated, one_process
 from gridreg.ops.cpu.jit.table import TABLE, cube, integer, matrix, next_task, real, vector
 
@@ -65,7 +67,8 @@ class Kernel:
         if self._compiled is None:
             with _COMPILING:
                 if self._compiled is None:
-                    self._compiled = self._compile()
+                    with timed():
+                        self._compiled = self._compile()
         return int(self._compiled.address)
 
     @property
@@ -98,7 +101,8 @@ class Kernel:
                     empty = forget_outdated(folder)
                 if empty and can_lock() and self.function.__module__.startswith(_OPERATIONS):
                     _precompile()
-                with one_process(folder, self.name):
+                ready = any(Path(folder).glob(f"{self.name}-*.nbi"))
+                with contextlib.nullcontext() if ready else compiling(), one_process(folder, self.name):
                     try:
                         return compiled(cache=True)(serving)
                     except Exception:
