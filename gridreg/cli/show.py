@@ -50,7 +50,7 @@ def run(options: ShowOptions) -> int:
 
 
 def _beyond(options: ShowOptions) -> str | None:
-    """What has a name without being listed: a counted protocol, a preset's whole configuration."""
+    """Text of what is not listed by its name: a counted protocol, a preset's whole configuration."""
     from gridreg.training.config import to_yaml
     from gridreg.training.presets import load_preset, preset_names
 

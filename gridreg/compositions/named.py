@@ -49,7 +49,7 @@ def composition_names() -> list[str]:
 
 
 def composition_about(name: str) -> str:
-    """What a composition is: the docstring of the function that makes it."""
+    """Description of a composition: the docstring of the function that makes it."""
     return inspect.getdoc(_COMPOSITIONS[name]) or ""
 
 

@@ -234,7 +234,7 @@ def get_protocol(name: str) -> Protocol:
     Besides :data:`PROTOCOLS` there are the counted forms of :data:`COUNTED`. Those of a body count in the views of
     ``human8``; ``spread<N>`` is RegNeRF's choice of 3, 6 and 9 views of LLFF scenes; SplatFields' k-means had one
     start or, by default when it was published, ten. Settings are chosen with ``-validation``, without a look at the
-    test views; `gridreg tune` chooses with ``-leave<K>``, which trains on all views but the K-th, from 0, and scores it.
+    test views; `gridreg tune` chooses with ``-leave<K>``, which scores one of the views, the K-th from 0.
 
     Raises:
         InputError: for an unknown name.

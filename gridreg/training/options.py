@@ -36,7 +36,7 @@ class TrainOptions:
     """Scene folder (Blender, transforms.json, COLMAP, LLFF); without one, the built-in scene."""
     protocol: _Name = None
     """Views by name: dietnerf8 (default for Blender), holdout8 (default for one list), gs8, fewtensorf8, zerorf4,
-    zerorf6, human8, human50, builtin8, views<N>, first<N>, spread<N>, human<N>, splatfields<N>."""
+    zerorf6, human8, human50, builtin8, views<N>, first<N>, spread<N>, human<N>, splatfields<N> ..."""
     size: _Number = None
     """Width of the images in pixels; must divide what is stored; default: the protocol's."""
     opaque: bool = False
