@@ -3,17 +3,37 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from gridreg.export import check_drawing, draw_run, live_view
-from gridreg.training import TrainOptions, configure, execute, open_scene, output_folder
+from gridreg.scenes import Scene
+from gridreg.training import (
+    RunConfig,
+    Trainer,
+    TrainOptions,
+    build_trainer,
+    configure,
+    execute,
+    open_scene,
+    output_folder,
+)
 from gridreg.training.record import summary
 
 __all__ = ["run"]
 
 
-def run(options: TrainOptions) -> int:
+def run(
+    options: TrainOptions,
+    make: Callable[[RunConfig, Scene], Trainer] = build_trainer,
+    command: Sequence[str] = (),
+) -> int:
     """Train, score, draw; 130 if it was interrupted, with its checkpoint saved.
+
+    Args:
+        options: of the command line.
+        make: makes the trainer at step 0.
+        command: the command line, for the record; default: that of ``gridreg``.
 
     Raises:
         InputError: for anything that a user can mend.
@@ -28,8 +48,9 @@ def run(options: TrainOptions) -> int:
             f"{scene.train.width}x{scene.train.height}; results go to {out}",
             flush=True,
         )
+        command = command or ["gridreg", *sys.argv[1:]]
         execution, metrics = execute(
-            config, scene, out, resume=options.resume, command=["gridreg", *sys.argv[1:]], watch=look
+            config, scene, out, resume=options.resume, command=command, watch=look, make=make
         )
         if metrics is None:
             return 130

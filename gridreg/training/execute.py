@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -201,6 +201,7 @@ def execute(
     command: Sequence[str] = (),
     on_step: Any = None,
     watch: Watch | None = None,
+    make: Callable[[RunConfig, Scene], Trainer] = build_trainer,
 ) -> tuple[Execution, dict[str, Any] | None]:
     """Train, score and record one run.
 
@@ -215,6 +216,7 @@ def execute(
         command: the command line, for the record.
         on_step: called with the `StepReport` of every iteration.
         watch: told when the run starts, and of every iteration.
+        make: makes the trainer at step 0.
 
     Returns:
         The execution, and the metrics, or None if it was interrupted (its checkpoint is saved).
@@ -232,12 +234,12 @@ def execute(
             )
         began = work_clock()
         if resume:
-            trainer, record = resume_trainer(checkpoint, config, scene)
+            trainer, record = resume_trainer(checkpoint, config, scene, make)
             history, times = History(), dict(record["seconds"])
             history.load_state_dict(record["history"])
         else:
             trainer, history, times = (
-                build_trainer(config, scene),
+                make(config, scene),
                 History(max(1, config.train.steps // 200)),
                 {},
             )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from gridreg.training.trainer import Trainer
 
 __all__ = [
     "build_trainer",
+    "check_size",
     "open_scene",
     "regularizers_of",
     "resume_trainer",
@@ -61,8 +62,12 @@ def regularizers_of(config: RunConfig) -> list[Regularizer]:
     return list(gridreg.from_config(config.composition))
 
 
-def build_trainer(config: RunConfig, scene: Scene) -> Trainer:
-    """Field and trainer of a configuration, at step 0."""
+def check_size(config: RunConfig) -> None:
+    """Refuse a configuration that needs more memory than there is.
+
+    Raises:
+        InputError: names the setting.
+    """
     settings = config.train
     check_memory(400 * settings.rays, f"train.rays={settings.rays}")
     if config.backbone == "vm":
@@ -71,6 +76,12 @@ def build_trainer(config: RunConfig, scene: Scene) -> Trainer:
         check_memory(
             768 * voxels ** (2 / 3), f"train.voxels_start, train.voxels_end: a grid of {voxels} voxels"
         )
+
+
+def build_trainer(config: RunConfig, scene: Scene) -> Trainer:
+    """Field and trainer of a configuration, at step 0."""
+    check_size(config)
+    settings = config.train
     bounds = carved_box(scene) if settings.carve and not scene.ndc else scene.bounds
     field = make_field(
         config.backbone,
@@ -102,8 +113,13 @@ def save_run(folder: Path, trainer: Trainer, config: RunConfig, record: dict[str
     save_checkpoint(folder, state, config=to_data(config), fingerprint=trainer.scene.fingerprint)
 
 
-def resume_trainer(folder: Path, config: RunConfig, scene: Scene) -> tuple[Trainer, dict[str, Any]]:
-    """The trainer as it was when the checkpoint was written, and the record saved with it.
+def resume_trainer(
+    folder: Path,
+    config: RunConfig,
+    scene: Scene,
+    make: Callable[[RunConfig, Scene], Trainer] = build_trainer,
+) -> tuple[Trainer, dict[str, Any]]:
+    """The trainer as it was when the checkpoint was written, made anew, and the record saved with it.
 
     Raises:
         InputError: if the checkpoint is missing, damaged, of another scene or of another configuration.
@@ -124,6 +140,6 @@ def resume_trainer(folder: Path, config: RunConfig, scene: Scene) -> tuple[Train
             f"{folder}: a checkpoint of another configuration (differs in {', '.join(different)}); "
             "resume with the configuration it was started with, or choose another output folder"
         )
-    trainer = build_trainer(config, scene)
+    trainer = make(config, scene)
     trainer.load_state_dict(saved.state["trainer"])
     return trainer, saved.state["record"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from typing import Any
@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 import gridreg
-from gridreg.base import Regularizer
+from gridreg.base import LocalTerm, Regularizer
 from gridreg.errors import InputError
 from gridreg.rendering import MarchSettings, Model, OccupancyGrid, Rays, Rendered, render_rays
 from gridreg.scenes import Scene
@@ -98,7 +98,8 @@ class Trainer:
             return optimizer
         return torch.optim.Adam(groups, betas=(0.9, 0.99))
 
-    def _set_learning_rates(self) -> None:
+    def set_learning_rates(self) -> None:
+        """Give the optimizer the rates of this step."""
         progress = (self.step - self._restart_at) / self.settings.steps
         factor = self.settings.learning_rate_decay**progress
         for group in self.optimizer.param_groups:
@@ -172,11 +173,30 @@ class Trainer:
             InputError: if the loss is not finite, with the step; the parameters are those before the step.
         """
         self.handle.step(self.step)
-        self._set_learning_rates()
+        self.set_learning_rates()
         rendered, target = self.render_batch()
         mse = (rendered.colour[: len(target)] - target).square().mean()
-        folded = self.handle.grid_terms() if getattr(self.optimizer, "accepts_local_terms", False) else []
-        loss = mse + self.handle.loss(rendered.samples, exclude={term.name for term in folded})
+        terms = self.local_terms()
+        loss = mse + self.handle.loss(rendered.samples, exclude={term.name for term in terms})
+        report = self.descend(loss, mse, terms)
+        self.advance()
+        return report
+
+    def local_terms(self) -> list[LocalTerm]:
+        """Grid penalties that the optimizer takes over, if it can: they need not be in the loss."""
+        return self.handle.grid_terms() if getattr(self.optimizer, "accepts_local_terms", False) else []
+
+    def descend(self, loss: Tensor, mse: Tensor, terms: Sequence[LocalTerm] = ()) -> StepReport:
+        """Gradients and one step of the optimizer.
+
+        Args:
+            loss: what is descended.
+            mse: the part of it that is the error of the batch, for the report.
+            terms: of `local_terms`.
+
+        Raises:
+            InputError: if the loss is not finite, with the step; the parameters stay.
+        """
         value = loss.item()
         if not math.isfinite(value):
             raise InputError(
@@ -189,16 +209,19 @@ class Trainer:
                 loss.backward()  # type: ignore[no-untyped-call]
         report = StepReport(loss=value, mse=mse.item(), psnr=-10 * math.log10(max(mse.item(), 1e-12)))
         report.update({name: float(term) for name, term in self.handle.terms.items()})
-        if folded:
-            values: dict[str, float] = self.optimizer.step(local_terms=folded)  # type: ignore[call-overload]
+        if terms:
+            values: dict[str, float] = self.optimizer.step(local_terms=terms)  # type: ignore[call-overload]
             report.update(values)
         else:
             self.optimizer.step()
+        return report
+
+    def advance(self) -> None:
+        """Count the step, and carry out what the schedule has after it: resampling, shrinking, occupancy, averaging."""
         self.step += 1
         if self.space.run(self.step):
             self.restart_optimizer()
         self._average()
-        return report
 
     def train(self, until: int | None = None, each: Callable[[StepReport], bool] | None = None) -> None:
         """Iterate until a step (default: the end of the schedule) or until ``each`` returns False."""
