@@ -1,50 +1,86 @@
 """Damaged inputs of every format, for as long as is asked: how many were refused, accepted, and failed.
 
     python benchmarks/fuzz.py --minutes 30
+    python benchmarks/fuzz.py --inputs 20000
 
-A failure is an exception other than `gridreg.InputError`, a refusal that is not one clear line, something accepted that
-is not finite, positive and ordered, or more than two seconds of processor time. The files of each failure are kept in
-the folder ``--corpus``, so that it can be looked at and become a test; the figures of each format are printed.
+A failure is an exception other than `gridreg.InputError`, a refusal that is not one printable line of at most 500
+characters, something accepted that is not finite, positive and ordered, more than two seconds of processor time, or
+more than 300 MB of memory at any moment. Memory is counted from what this process holds after all imports and one
+sound input of each format (that figure is printed): its peak is counted anew for every input (``VmHWM``). Each
+failure is kept as a file in the folder ``--corpus``, from where it goes to ``tests/fuzz/corpus``, which a test
+replays. The figures go to benchmarks/results/fuzz.jsonl after each round of 200 inputs, by first seed.
 """
 
 from __future__ import annotations
 
 import argparse
-import resource
-import shutil
 import sys
 import tempfile
 import time
 from collections import Counter
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
+import stored
 from hypothesis import HealthCheck, Phase, given, seed, settings
 
+from gridreg.training.versions import versions
+
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from tests.fuzz.formats import Input, inputs
-from tests.fuzz.judge import judge
+from tests.fuzz.corpus import store
+from tests.fuzz.formats import Input
+from tests.fuzz.formats_of_runs import inputs
+from tests.fuzz.judge import Verdict, judge, memory
 
 ROUND = 200
+WARM_UP = 2
 
 
-def campaign(minutes: float, corpus: Path, first_seed: int = 0) -> dict[str, Counter[str]]:
-    """Judge inputs until the time is up.
+@dataclass
+class Campaign:
+    """What was tried so far.
 
-    Args:
-        minutes: how long.
+    Attributes:
         corpus: folder for the files of what failed.
-        first_seed: of the first round of inputs; each round has the next one.
-
-    Returns:
-        For each format how many inputs were refused, accepted and failed.
+        base: memory that the process held before the first input, MB.
+        counts: of each format, how many were refused, accepted and failed.
+        seconds: the most processor time that an input took, of each format.
+        megabytes: the most memory above ``base``, likewise.
+        said: kinds of failures, with how often each was seen.
     """
-    counts: dict[str, Counter[str]] = {}
-    end = time.monotonic() + 60 * minutes
 
-    def one_round(number: int) -> None:
+    corpus: Path
+    base: float = 0.0
+    counts: dict[str, Counter[str]] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+    megabytes: dict[str, float] = field(default_factory=dict)
+    said: Counter[str] = field(default_factory=Counter)
+
+    @property
+    def total(self) -> Counter[str]:
+        """Outcomes of all formats together."""
+        return sum(self.counts.values(), Counter[str]())
+
+    def add(self, item: Input, verdict: Verdict) -> None:
+        """Count an input and keep one that failed."""
+        kind = item.kind
+        tally = self.counts.setdefault(kind, Counter())
+        tally[verdict.outcome] += 1
+        self.seconds[kind] = max(self.seconds.get(kind, 0.0), verdict.seconds)
+        self.megabytes[kind] = max(self.megabytes.get(kind, 0.0), verdict.megabytes)
+        if verdict.outcome == "failed":
+            self.said[f"{kind}: {verdict.said[:60]}"] += 1
+            place = self.corpus / f"{kind.replace(' ', '_').replace('.', '_')}-{self.total.total()}.json"
+            store(item, verdict.said, place)
+            print(f"{kind}: {verdict.said} ({place})", file=sys.stderr, flush=True)
+
+    def round(self, number: int, count: int, keep: bool = True) -> None:
+        """Judge inputs; the number is their seed."""
+
         @seed(number)
         @settings(
-            max_examples=ROUND,
+            max_examples=count,
             deadline=None,
             database=None,
             phases=[Phase.generate],
@@ -53,44 +89,58 @@ def campaign(minutes: float, corpus: Path, first_seed: int = 0) -> dict[str, Cou
         @given(inputs())
         def look(item: Input) -> None:
             with tempfile.TemporaryDirectory() as folder:
-                verdict = judge(item, Path(folder))
-                tally = counts.setdefault(item.kind, Counter())
-                tally[verdict.outcome] += 1
-                if verdict.outcome == "failed":
-                    place = corpus / f"{item.kind.replace(' ', '_')}-{number}-{tally['failed']}"
-                    shutil.copytree(folder, place, dirs_exist_ok=True)
-                    print(f"{item.kind}: {verdict.said} ({place})", file=sys.stderr, flush=True)
+                verdict = judge(item, Path(folder), base=self.base or None)
+                if keep:
+                    self.add(item, verdict)
 
         look()
 
-    number = first_seed
-    while time.monotonic() < end:
-        one_round(number)
-        number += 1
-    return counts
+    def record(self, first_seed: int, began: float) -> dict[str, Any]:
+        """Return the figures as plain data."""
+        formats = {
+            kind: {"tried": tally.total(), **{o: tally[o] for o in ("refused", "accepted", "failed")}}
+            | {"seconds": round(self.seconds[kind], 2), "megabytes": round(self.megabytes[kind])}
+            for kind, tally in sorted(self.counts.items())
+        }
+        return {
+            "tried": self.total.total(),
+            "failed": self.total["failed"],
+            "first_seed": first_seed,
+            "seconds": round(time.monotonic() - began),
+            "base_megabytes": round(self.base),
+            "formats": formats,
+            "failures": dict(self.said.most_common(20)),
+            "versions": versions(),
+        }
 
 
 def main() -> None:
-    """Run a campaign and print its figures; exit with 1 if anything failed."""
+    """Run a campaign, print and store its figures; exit with 1 if anything failed."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--minutes", type=float, default=1.0, help="how long")
-    parser.add_argument("--corpus", type=Path, default=Path("outputs/fuzz"), help="where failures are kept")
+    parser.add_argument("--minutes", type=float, default=1.0, help="how long, at the least")
+    parser.add_argument("--inputs", type=int, default=0, help="how many, at the least")
+    parser.add_argument("--corpus", type=Path, default=Path("outputs/fuzz"), help="folder for failures")
     parser.add_argument("--seed", type=int, default=0, help="of the first round")
+    parser.add_argument("--results", type=Path, default=stored.RESULTS)
     options = parser.parse_args()
-    counts = campaign(options.minutes, options.corpus, options.seed)
-    total: Counter[str] = Counter()
-    for kind, tally in sorted(counts.items()):
-        total += tally
-        print(f"{kind:16} {tally.total():7} tried {_words(tally)}")
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
-    print(f"{'all':16} {total.total():7} tried {_words(total)}, at most {peak:.0f} MB")
-    sys.exit(1 if total["failed"] else 0)
-
-
-def _words(tally: Counter[str]) -> str:
-    return ", ".join(f"{tally[outcome]:7} {outcome}" for outcome in ("refused", "accepted", "failed"))
+    began, end = time.monotonic(), time.monotonic() + 60 * (0.0 if options.inputs else options.minutes)
+    campaign = Campaign(options.corpus)
+    # What is imported late, and what the readers keep for good, is part of the process and not of an input.
+    campaign.round(10**6 + options.seed, WARM_UP * ROUND, keep=False)
+    campaign.base = memory()[0]
+    number = options.seed
+    while campaign.total.total() < options.inputs or time.monotonic() < end:
+        campaign.round(number, ROUND)
+        number += 1
+        stored.save("fuzz", f"seed {options.seed}", campaign.record(options.seed, began), options.results)
+    record = campaign.record(options.seed, began)
+    for kind, figures in record["formats"].items():
+        print(f"{kind:16} {figures}")
+    shown = {key: record[key] for key in ("tried", "failed", "seconds", "base_megabytes")}
+    print(f"{'all':16} {shown}")
+    sys.exit(1 if record["failed"] else 0)
 
 
 if __name__ == "__main__":

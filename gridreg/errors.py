@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+import logging
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
-__all__ = ["RENAMED", "ConfigError", "InputError", "KeyPath", "near_names", "one_line"]
+__all__ = ["RENAMED", "ConfigError", "InputError", "KeyPath", "near_names", "one_line", "silenced"]
 
 RENAMED = {
     "Distortion": "DistortionLoss",
@@ -37,6 +39,18 @@ def one_line(text: str, longest: int = _LONGEST) -> str:
         return shown
     tail = "".join(c if c.isprintable() else "?" for c in text[-longest // 4 :])
     return f"{shown[: longest - len(tail) - 5]} ... {tail}"
+
+
+@contextmanager
+def silenced(library: str) -> Iterator[None]:
+    """Keep a library from logging lines of its own about a file: what goes wrong is raised, or does not matter."""
+    logger = logging.getLogger(library)
+    before = logger.level
+    logger.setLevel(logging.CRITICAL + 1)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
 
 
 class InputError(ValueError):

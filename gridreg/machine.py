@@ -1,13 +1,18 @@
-"""The machine: cores that this process may use, and whether what is asked for fits into memory."""
+"""The machine: cores that this process may use, what fits into memory, and what dead processes have left."""
 
 from __future__ import annotations
 
 import os
+import platform
+import re
+import secrets
+import shutil
+import zlib
 from pathlib import Path
 
 from gridreg.errors import InputError
 
-__all__ = ["available_memory", "check_memory", "usable_cores"]
+__all__ = ["available_memory", "check_memory", "remove_left_behind", "temporary_beside", "usable_cores"]
 
 _CGROUP = (
     ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
@@ -64,3 +69,43 @@ def check_memory(needed: float, what: str) -> None:
 def usable_cores() -> int:
     """Cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def temporary_beside(path: Path) -> Path:
+    """A hidden name beside ``path`` that nobody else uses, and that tells later runs whose it is.
+
+    A process that is killed leaves its file; `remove_left_behind` takes it away once that process is gone.
+    """
+    # A token, not a fixed name: workers of one experiment may write the same file at the same time.
+    token = f"{_machine()}-{os.getpid()}-{secrets.token_hex(4)}"
+    return path.with_name(f".{path.stem}.{token}.tmp{path.suffix}")
+
+
+_TEMPORARY = re.compile(r"\..*\.([0-9a-f]{8})-(\d+)-[0-9a-f]{8}\.tmp(\..*)?", re.DOTALL)
+
+
+def _machine() -> str:
+    """Eight characters that differ between machines that share a disk: processes of others cannot be looked up."""
+    return f"{zlib.crc32(platform.node().encode('utf-8', 'surrogateescape')):08x}"
+
+
+def remove_left_behind(folder: Path) -> None:
+    """Remove temporary files and folders of processes of this machine that have died."""
+    for entry in list(folder.iterdir()):
+        found = _TEMPORARY.fullmatch(entry.name)
+        if found is not None and found[1] == _machine() and not _lives(int(found[2])):
+            if entry.is_dir() and not entry.is_symlink():
+                shutil.rmtree(entry, ignore_errors=True)
+            else:
+                entry.unlink(missing_ok=True)
+
+
+def _lives(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except OSError:
+        # Somebody else's, or a system that does not tell.
+        return True
+    return True

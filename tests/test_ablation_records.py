@@ -137,7 +137,7 @@ def test_history(tmp_path):
     (tmp_path / "history.jsonl").write_text('{"step": 1, "psnr": 9.5}\n\n{"step": 2}\n')
     assert result.history() == [{"step": 1, "psnr": 9.5}, {"step": 2}]
     (tmp_path / "history.jsonl").write_text("{")
-    with pytest.raises(InputError, match=r"history\.jsonl: cannot read"):
+    with pytest.raises(InputError, match=r"history\.jsonl:1: not a row"):
         result.history()
 
 

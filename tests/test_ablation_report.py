@@ -257,7 +257,7 @@ def test_files_that_cannot_be_read_are_said(tmp_path: Path) -> None:
     (broken / "history.jsonl").write_text("{not json\n")
     (broken / "test" / "r_0.png").write_bytes(b"no picture")
     text = write_report(store, study, tmp_path / "r.html").read_text()
-    assert "history.jsonl: cannot read the history" in text
+    assert "history.jsonl:1: not a row of a history" in text
 
 
 def test_same_results_make_the_same_bytes(made: tuple[Path, Results], tmp_path: Path) -> None:

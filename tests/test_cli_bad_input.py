@@ -296,7 +296,7 @@ def test_another_scene(refused: Refused, tmp_path: Path, empty_run: Path, scene:
 
 
 def test_meshes_that_are_none(refused: Refused, tmp_path: Path) -> None:
-    assert "mesh.ply: no such mesh file" in refused("compare-mesh", "mesh.ply", "builtin")
+    assert "mesh.ply: mesh file not found" in refused("compare-mesh", "mesh.ply", "builtin")
     (tmp_path / "mesh.ply").write_text("ply\nnonsense")
     assert "mesh.ply" in refused("compare-mesh", "mesh.ply", "builtin")
 

@@ -87,7 +87,7 @@ def test_a_damaged_line_is_named(tmp_path, line):
 
 
 def test_a_missing_history(tmp_path):
-    with pytest.raises(InputError, match="cannot read the history"):
+    with pytest.raises(InputError, match="history not found"):
         History.load(tmp_path / "none.jsonl")
 
 

@@ -88,7 +88,7 @@ class TestFiles:
         assert [p.name for p in tmp_path.iterdir()] == ["mesh.ply"]
 
     def test_unreadable_files(self, tmp_path):
-        with pytest.raises(InputError, match="no such mesh file"):
+        with pytest.raises(InputError, match="mesh file not found"):
             read_mesh(tmp_path / "none.ply")
         broken = tmp_path / "broken.ply"
         broken.write_bytes(b"ply\nformat ascii 1.0\nelement vertex 3\nend_header\n1 2\n")

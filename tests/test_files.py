@@ -213,8 +213,8 @@ def test_remove_folder(tmp_path):
 def run(code: str, *arguments: object) -> subprocess.CompletedProcess[str]:
     """A child process with the module at hand."""
     code = (
-        "import os, signal, sys\nfrom pathlib import Path\nfrom gridreg.training import files\n"
-        + textwrap.dedent(code)
+        "import os, signal, sys\nfrom pathlib import Path\nfrom gridreg.machine import temporary_beside\n"
+        "from gridreg.training import files\n" + textwrap.dedent(code)
     )
     return subprocess.run([sys.executable, "-c", code, *map(str, arguments)], capture_output=True, text=True)
 
@@ -223,7 +223,7 @@ def test_what_a_killed_process_left_goes_with_the_next_run(tmp_path):
     done = run(
         """
         with files.writing(Path(sys.argv[1]) / "mesh.ply") as temporary:
-            files.temporary_beside(Path(sys.argv[1]) / "frames").mkdir()
+            temporary_beside(Path(sys.argv[1]) / "frames").mkdir()
             temporary.write_bytes(b"part")
             os.kill(os.getpid(), signal.SIGKILL)
         """,

@@ -17,6 +17,7 @@ import torch
 from gridreg.ablation.perform import Scenes, TaskResult, perform
 from gridreg.ablation.records import RunSpec
 from gridreg.errors import InputError
+from gridreg.machine import remove_left_behind, temporary_beside
 from gridreg.scenes import Scene
 from gridreg.training.files import output_errors, remove_folder
 
@@ -100,8 +101,10 @@ def write_folder(files: Mapping[str, bytes], folder: Path) -> None:
     """
     with output_errors(folder):
         folder.parent.mkdir(parents=True, exist_ok=True)
-        fresh = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=".new", dir=folder.parent))
+        remove_left_behind(folder.parent)
+        fresh = temporary_beside(folder)
         try:
+            fresh.mkdir()
             for name, content in files.items():
                 place = PurePosixPath(name)
                 # What a worker sends is written below this folder and nowhere else.

@@ -10,8 +10,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
-from gridreg.errors import InputError
-
 __all__ = ["NUMERICS_VERSION", "STATUSES", "RunResult", "RunSpec", "Status", "Study"]
 
 NUMERICS_VERSION = 4
@@ -161,13 +159,10 @@ class RunResult:
             InputError: if the file cannot be read.
         """
         path = self.folder / "history.jsonl"
-        try:
-            lines = path.read_text(encoding="utf-8").splitlines()
-            return [json.loads(line) for line in lines if line.strip()]
-        except FileNotFoundError:
-            return []
-        except (OSError, ValueError) as error:
-            raise InputError(f"{path}: cannot read the history: {error}") from error
+        # Which draws curves too, and is slow to import.
+        from gridreg.training.curves import History
+
+        return History.load(path).rows if path.exists() else []
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ import tyro
 from gridreg.ablation.records import RunResult, RunSpec, Study
 from gridreg.ablation.report import write_report
 from gridreg.errors import InputError, near_names
+from gridreg.scenes.files import read_text
 
 __all__ = ["ReportOptions", "TableResults", "read_table", "run"]
 
@@ -82,14 +83,10 @@ def read_table(path: Path) -> tuple[str, list[RunResult]]:
     Raises:
         InputError: one line that names the table, the line and the column of what is wrong.
     """
+    text = read_text(path, "table")
     try:
-        text = path.read_text(encoding="utf-8-sig")
         reader = csv.DictReader(io.StringIO(text), strict=True)
         rows = [(reader.line_num, row) for row in reader]
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not UTF-8 text at byte {error.start}") from error
-    except OSError as error:
-        raise InputError(f"{path}: cannot read: {error.strerror}") from error
     except csv.Error as error:
         raise InputError(f"{path}: not a table of comma-separated values: {error}") from error
     columns = [column.strip() for column in reader.fieldnames or ()] if rows else []

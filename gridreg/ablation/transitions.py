@@ -15,6 +15,7 @@ from gridreg.ablation.claims import LEASE_SECONDS, Claim
 from gridreg.ablation.records import STATUSES, RunSpec, Status, Study
 from gridreg.ablation.workers import Worker
 from gridreg.errors import InputError
+from gridreg.scenes.files import read_json
 
 RESULT_NAME = "result.json"
 """File in a run's folder with a copy of the result; whole or not there."""
@@ -115,7 +116,7 @@ def set_done(connection: sqlite3.Connection, spec_hash: str, record: Mapping[str
 def import_result(connection: sqlite3.Connection, spec: RunSpec, folder: Path) -> None:
     """Take over the result that stands in the folder of a run that the database did not know, if there is one."""
     with contextlib.suppress(OSError, ValueError, LookupError, TypeError, AttributeError):
-        record = json.loads((folder / RESULT_NAME).read_bytes())
+        record = read_json(folder / RESULT_NAME)
         # Not only the name of the folder: the result must be that of this very run, in today's numerics.
         if RunSpec.from_json(record["spec"]).hash == spec.hash and metrics_of(json.dumps(record["metrics"])):
             known = {"seconds": 0.0, "machine": "", "fingerprint": "", **record}

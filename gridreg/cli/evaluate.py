@@ -33,8 +33,18 @@ def run(options: EvalOptions) -> int:
     """Print the score of each test view and their mean.
 
     Raises:
-        InputError: for a missing or damaged checkpoint, another scene, other weights, or a place that is not writable.
+        InputError: for a missing or damaged checkpoint, another scene, other weights, or a place that is not
+            writable or that another run writes to.
     """
+    from gridreg.training.files import check_output_folder, one_writer
+
+    if options.out is None:
+        return _score(options)
+    with one_writer(check_output_folder(options.out)):
+        return _score(options)
+
+
+def _score(options: EvalOptions) -> int:
     from gridreg.cli.runs import folder_of, scene_of
     from gridreg.export import write_page
     from gridreg.ops.compilation import work_clock

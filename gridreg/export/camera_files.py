@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from gridreg.errors import InputError
@@ -36,6 +37,7 @@ def save_cameras(path: str | Path, cameras: Sequence[Camera]) -> None:
     write_json(path, {"frames": frames})
 
 
+@np.errstate(all="ignore")
 def load_cameras(path: str | Path, lens: Lens | None = None, world: World = IN_PLACE) -> list[Camera]:
     """Read a camera file: what `save_cameras` writes, or any ``transforms.json`` (without its images).
 

@@ -10,7 +10,10 @@ from typing import Any
 
 import numpy as np
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
+
+from gridreg.errors import InputError
+from gridreg.scenes import decoding
 
 __all__ = [
     "LONGEST_SIDE",
@@ -53,12 +56,12 @@ def spread_views(names: Iterable[str], count: int) -> list[str]:
 
 
 def open_image(path: Path) -> Image.Image | None:
-    """A PNG or JPEG, without alpha; None if it cannot be read."""
+    """An image, without alpha; None if it cannot be read."""
     try:
-        with Image.open(path, formats=["PNG", "JPEG"]) as image:
+        with decoding.open_image(path) as image:
             converted: Image.Image = image.convert("RGB")
             return converted
-    except (OSError, UnidentifiedImageError, Image.DecompressionBombError):
+    except InputError:
         return None
 
 

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import io
-import logging
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +13,7 @@ import trimesh
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gridreg.errors import InputError
+from gridreg.errors import InputError, silenced
 from gridreg.export._glb import Y_UP, glb_of, srgb_of
 from gridreg.export.decimation import check_faces, decimate
 from gridreg.export.marching import Faces, Vertices, drop_small_components, polygonise, vertex_normals
@@ -24,6 +21,7 @@ from gridreg.export.volume import SeenDensity, sample_density, surface_threshold
 from gridreg.machine import check_memory
 from gridreg.rendering import Field, OccupancyGrid
 from gridreg.scenes import IN_PLACE, World
+from gridreg.scenes.files import read_bytes
 from gridreg.segments import optical_depth_to_weights
 from gridreg.training.files import check_output_folder, writing
 
@@ -244,6 +242,7 @@ def write_mesh(
     return mesh
 
 
+@np.errstate(all="ignore")
 def read_mesh(path: str | Path) -> Mesh:
     """Read a triangle mesh; the parts of a scene become one mesh. No other file, texture or archive is opened.
 
@@ -252,14 +251,12 @@ def read_mesh(path: str | Path) -> Mesh:
             faces, or a face names a corner that is not there.
     """
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such mesh file")
     if path.suffix.lower() not in READABLE:
         raise InputError(f"{path}: found suffix {path.suffix!r}, expected a mesh: {', '.join(READABLE)}")
     try:
         # Bytes have no neighbours: materials, textures and buffers beside the file cannot be named.
-        content, kind = io.BytesIO(path.read_bytes()), path.suffix.lower()[1:]
-        with _quiet():
+        content, kind = io.BytesIO(read_bytes(path, "mesh file")), path.suffix.lower()[1:]
+        with silenced("trimesh"):
             loaded = trimesh.load_mesh(content, file_type=kind, process=False, skip_materials=True)
         mesh = loaded.to_mesh() if isinstance(loaded, trimesh.Scene) else loaded
         if kind == "stl":
@@ -267,6 +264,8 @@ def read_mesh(path: str | Path) -> Mesh:
             mesh.merge_vertices()
         vertices = np.asarray(mesh.vertices, dtype=np.float64)
         faces = np.asarray(mesh.faces, dtype=np.int64)
+    except InputError:
+        raise
     # The readers of trimesh raise whatever their formats make them raise.
     except Exception as error:
         text = str(error).splitlines()[0] if str(error) else type(error).__name__
@@ -284,15 +283,3 @@ def read_mesh(path: str | Path) -> Mesh:
     if kind in ("glb", "gltf"):
         vertices, colours = vertices @ Y_UP, None if colours is None else srgb_of(colours)
     return Mesh(vertices, faces, colours)
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep trimesh from logging tracebacks: what goes wrong is raised, or does not matter."""
-    logger = logging.getLogger("trimesh")
-    before = logger.level
-    logger.setLevel(logging.CRITICAL + 1)
-    try:
-        yield
-    finally:
-        logger.setLevel(before)

@@ -16,7 +16,8 @@ import numpy as np
 from PIL import Image
 
 from gridreg.errors import InputError
-from gridreg.training.files import check_output_folder, output_errors, temporary_beside, writing
+from gridreg.machine import temporary_beside
+from gridreg.training.files import check_output_folder, output_errors, writing
 from gridreg.training.images import ImageArray
 
 __all__ = ["check_target", "find_ffmpeg", "write_video"]

@@ -34,6 +34,24 @@ class OccupancyGrid:
         """A grid with every cell occupied."""
         return cls(bounds.clone(), torch.ones(resolution, dtype=torch.uint8, device=bounds.device))
 
+    @classmethod
+    def restored(cls, saved: dict[str, Tensor]) -> OccupancyGrid:
+        """A grid of its attributes, as a checkpoint of anybody's holds them.
+
+        Raises:
+            ValueError: if they are no cells in a box.
+        """
+        grid = cls(**saved)
+        box, hull = grid.bounds, grid.cells if grid.hull is None else grid.hull
+        if not (
+            all(each.ndim == 3 and each.dtype == torch.uint8 and each.numel() for each in (grid.cells, hull))
+            and grid.cells.shape == hull.shape
+            and tuple(box.shape) == (2, 3)
+            and bool(torch.isfinite(box).all() and (box[0] < box[1]).all())
+        ):
+            raise ValueError("occupancy is no grid of cells in a box")
+        return grid
+
     @property
     def resolution(self) -> tuple[int, int, int]:
         """Cells along x, y, z."""

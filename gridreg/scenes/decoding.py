@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import ExifTags, Image, ImageFile, UnidentifiedImageError
 
-from gridreg.errors import InputError
+from gridreg.errors import InputError, silenced
 from gridreg.machine import check_memory
 from gridreg.scenes.files import read_bytes
 
@@ -86,7 +86,7 @@ def open_image(path: Path) -> Iterator[Image.Image]:
     data = read_bytes(path, "image")
     try:
         # Without Pillow's own words on broken EXIF data: `exif_turn` refuses them in one line.
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), silenced("PIL"):
             warnings.simplefilter("ignore")
             _enable_heif(data, path)
             Image.init()
@@ -107,7 +107,10 @@ def open_image(path: Path) -> Iterator[Image.Image]:
         check_memory(40 * image.width * image.height, f"{path}: image is {image.width}x{image.height},")
         try:
             _check_data(data, image.format)
-            yield image
+            # Nor their words on tags and chunks that are not needed.
+            with warnings.catch_warnings(), silenced("PIL"):
+                warnings.simplefilter("ignore")
+                yield image
         except InputError:
             raise
         except Exception as error:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridreg.errors import InputError
+from gridreg.machine import temporary_beside
 
 __all__ = ["draw_cameras"]
 
@@ -71,7 +72,7 @@ def draw_cameras(
         axes.set_box_aspect((1, 1, 1))
         axes.view_init(elev=elevation, azim=-70)
     path = Path(path)
-    beside = path.with_name(f".{path.name}.part")
+    beside = temporary_beside(path)
     try:
         figure.savefig(beside, dpi=100, format="png")
         os.replace(beside, path)

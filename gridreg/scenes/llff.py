@@ -7,6 +7,7 @@ coordinates.
 from __future__ import annotations
 
 import io
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -98,7 +99,10 @@ def _factor(images: Path, name: str, stated: NDArray[np.float64]) -> NDArray[np.
 def _read_rows(path: Path) -> NDArray[np.float64]:
     data = read_bytes(path)
     try:
-        rows = np.load(io.BytesIO(data), allow_pickle=False)
+        # The header is Python's literals, and its parser warns of some of them.
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            rows = np.load(io.BytesIO(data), allow_pickle=False)
     except Exception as error:
         raise InputError(f"{path}: not a NumPy file ({str(error) or type(error).__name__})") from None
     if (

@@ -36,6 +36,8 @@ BUILTIN_MARKER = "builtin.json"
 """File that marks a folder as the built-in scene."""
 
 
+# What overflows float32 is named at the gate, not by a warning of NumPy's.
+@np.errstate(all="ignore")
 def load_scene(
     folder: str | Path,
     protocol: str | Protocol = "dietnerf8",

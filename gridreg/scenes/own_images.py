@@ -19,7 +19,7 @@ from gridreg.scenes import structure_from_motion
 from gridreg.scenes.colmap import frames_of_model, mask_of
 from gridreg.scenes.colmap_model import read_model
 from gridreg.scenes.decoding import decode, open_image
-from gridreg.scenes.files import EXTENSIONS, list_images, resolve_inside
+from gridreg.scenes.files import EXTENSIONS, list_images, read_bytes, resolve_inside
 from gridreg.scenes.frames import Frame, SceneFiles
 from gridreg.scenes.images import copy_upright, fit_mask, read_rgba
 
@@ -125,7 +125,7 @@ def _write_opaque(path: Path, target: Path) -> None:
     """Give features nothing to hold on to where an image is transparent: a flat grey."""
     rgba = read_rgba(path, opaque=True)
     if (rgba[..., 3] == 1).all():
-        target.write_bytes(path.read_bytes())
+        target.write_bytes(read_bytes(path, "image"))
         return
     flat = rgba[..., :3] * rgba[..., 3:] + 0.5 * (1 - rgba[..., 3:])
     Image.fromarray(np.rint(255 * flat).astype(np.uint8)).save(target)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -14,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridreg.errors import InputError
+from gridreg.machine import remove_left_behind, temporary_beside
 from gridreg.scenes.drawing import draw_cameras
 from gridreg.scenes.extent import Extent, box_is_seen, camera_extent, centred, points_extent
 from gridreg.scenes.frames import Frame, StatedIntrinsics
@@ -63,6 +63,7 @@ class Prepared:
         )
 
 
+@np.errstate(all="ignore")
 def prepare(
     source: str | Path,
     out: str | Path,
@@ -108,10 +109,11 @@ def prepare(
         raise InputError(f"{out}: exists already, expected the name of a new folder")
     if longest_edge < 8:
         raise InputError(f"longest_edge: found {longest_edge}, expected at least 8 pixels")
-    scratch: Path | None = None
+    scratch = temporary_beside(out)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        scratch = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
+        remove_left_behind(out.parent)
+        scratch.mkdir()
         scene = scratch / "scene"
         (scene / "images").mkdir(parents=True)
         made = _gather(source, scene, scratch, progress)
@@ -123,8 +125,7 @@ def prepare(
     except OSError as error:
         raise InputError(f"{out}: cannot be written ({error.strerror or error})") from None
     finally:
-        if scratch is not None:
-            shutil.rmtree(scratch, ignore_errors=True)
+        shutil.rmtree(scratch, ignore_errors=True)
     registered = tuple(Path(frame.file_path).name for frame in frames)
     missing = tuple(image.path.name for image in made.copied if image.path.name not in registered)
     return Prepared(out, registered, missing, extent, out / "cameras.png")

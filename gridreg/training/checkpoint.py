@@ -23,7 +23,8 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,10 +34,11 @@ from safetensors import SafetensorError
 from torch import Tensor
 
 from gridreg.errors import InputError
+from gridreg.machine import check_memory
 from gridreg.training.files import flush, output_errors, remove_folder, write_json
 from gridreg.training.state_tree import flatten_state, unflatten_state
 
-__all__ = ["FORMAT_VERSION", "Checkpoint", "has_checkpoint", "load_checkpoint", "save_checkpoint"]
+__all__ = ["FORMAT_VERSION", "Checkpoint", "has_checkpoint", "load_checkpoint", "save_checkpoint", "sound"]
 
 FORMAT_VERSION = 1
 """Raised by one whenever an older gridreg could not read what is written."""
@@ -141,19 +143,36 @@ def load_checkpoint(folder: str | os.PathLike[str], *, fingerprint: str | None =
         raise InputError(
             f"{os.fspath(folder)}: no checkpoint here, expected a folder with {_STATE} and {_TENSORS}"
         )
-    content, data = _read(found)
-    theirs = content["fingerprint"]
+    with sound(found):
+        content, data = _read(found)
+        theirs = content["fingerprint"]
     if fingerprint is not None and theirs != fingerprint:
         raise InputError(
-            f"{found}: a checkpoint of another scene (fingerprint {theirs[:12]!r}, expected "
+            f"{found}: a checkpoint of another scene (fingerprint {str(theirs)[:12]!r}, expected "
             f"{fingerprint[:12]!r}); choose another output folder, or the scene that it was trained on"
         )
-    try:
+    with sound(found):
         state = unflatten_state(safetensors.torch.load(data), content["state"])
-        config = unflatten_state({}, content["config"])
-    except (SafetensorError, ValueError, TypeError) as error:
-        raise _damaged(found, str(error)) from error
-    return Checkpoint(state, config, theirs)
+        return Checkpoint(state, unflatten_state({}, content["config"]), str(theirs))
+
+
+@contextmanager
+def sound(folder: str | os.PathLike[str]) -> Iterator[None]:
+    """Turn what the content of a checkpoint makes its readers raise into one line: it may be anybody's.
+
+    Raises:
+        InputError: if the block raised what values of another kind, shape or size than a run's lead to.
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except (
+        *(LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError),
+        *(AssertionError, MemoryError, SafetensorError),
+    ) as error:
+        lines = str(error).split("\n")
+        raise _damaged(Path(folder), f"{type(error).__name__}: {lines[0]}") from error
 
 
 def has_checkpoint(folder: str | os.PathLike[str]) -> bool:
@@ -176,7 +195,8 @@ def _current(folder: Path, new: Path, old: Path) -> Path | None:
         return folder
     if new.exists():
         try:
-            _read(new)
+            with sound(new):
+                _read(new)
         except InputError:
             # Died during the very first save, or the disk lost what it had confirmed.
             return old if old.exists() else None
@@ -209,6 +229,9 @@ def _read(folder: Path) -> tuple[dict[str, Any], bytes]:
         if path.exists() and not path.is_file():
             raise InputError(f"{path}: found no regular file, expected one")
     try:
+        # Bytes, and the tensors made of them.
+        check_memory(2 * (folder / _TENSORS).stat().st_size, f"{folder / _TENSORS}")
+        check_memory(20 * (folder / _STATE).stat().st_size, f"{folder / _STATE}")
         content = json.loads((folder / _STATE).read_bytes())
         data = (folder / _TENSORS).read_bytes()
     except FileNotFoundError as error:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from gridreg.errors import InputError
+from gridreg.scenes.files import read_text
 from gridreg.training.files import write_text, writing
 from gridreg.training.metrics import json_ready
 
@@ -100,16 +100,15 @@ class History:
             InputError: if the file cannot be read or a line is not such a row; names the line.
         """
         history = cls()
-        try:
-            lines = Path(path).read_text(encoding="utf-8").splitlines()
-        except (OSError, UnicodeDecodeError) as error:
-            raise InputError(f"{os.fspath(path)}: cannot read the history: {error}") from error
+        lines = read_text(path, "history").splitlines()
         for number, line in enumerate(lines, start=1):
+            if not line.strip():
+                continue
             try:
                 row = json.loads(line)
                 values = {k: float(v) for k, v in row.items() if k not in ("step", "masks")}
                 history.add(row["step"], values, masks=row.get("masks"))
-            except (ValueError, TypeError, KeyError, AttributeError) as error:
+            except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
                 raise InputError(f"{os.fspath(path)}:{number}: not a row of a history") from error
         return history
 

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from gridreg.errors import InputError
-from gridreg.training.checkpoint import has_checkpoint, save_checkpoint
-from gridreg.training.files import check_output_folder
+from gridreg.training.checkpoint import has_checkpoint, save_checkpoint, sound
+from gridreg.training.files import check_output_folder, one_writer
 from gridreg.training.loading import checkpoint_of, members_in
 
 __all__ = ["save_ensemble"]
@@ -29,11 +29,16 @@ def save_ensemble(folders: Sequence[str | Path], out: str | Path) -> int:
 
     Raises:
         InputError: for fewer than two runs, runs of different scenes, a missing or damaged checkpoint, a folder that
-            holds a run already, or a place that is not writable.
+            holds a run already or that another run writes to, or a place that is not writable.
     """
     if len(folders) < 2:
         raise InputError(f"ensemble: found {len(folders)} run, expected at least two")
     target = check_output_folder(out)
+    with one_writer(target):
+        return _save(folders, target)
+
+
+def _save(folders: Sequence[str | Path], target: Path) -> int:
     if has_checkpoint(target / "checkpoint"):
         raise InputError(f"{target}: holds a run already; choose another output folder")
     joined: list[dict[str, Any]] = []
@@ -41,7 +46,8 @@ def save_ensemble(folders: Sequence[str | Path], out: str | Path) -> int:
     for folder in folders:
         path = checkpoint_of(folder)
         members, _, fingerprint = members_in(path)
-        parts = [_part(member) for member in members]
+        with sound(path):
+            parts = [_part(member) for member in members]
         if joined and fingerprint != first:
             raise InputError(
                 f"{folder}: trained on another scene than {folders[0]} (fingerprint {fingerprint[:12]}, expected "

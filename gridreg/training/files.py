@@ -11,17 +11,14 @@ from __future__ import annotations
 import errno
 import json
 import os
-import platform
-import re
-import secrets
 import shutil
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from gridreg.errors import InputError
+from gridreg.machine import remove_left_behind, temporary_beside
 
 try:
     import fcntl
@@ -34,7 +31,6 @@ __all__ = [
     "one_writer",
     "output_errors",
     "remove_folder",
-    "temporary_beside",
     "write_bytes",
     "write_json",
     "write_text",
@@ -98,46 +94,6 @@ def writing(path: str | os.PathLike[str]) -> Iterator[Path]:
         except BaseException:
             temporary.unlink(missing_ok=True)
             raise
-
-
-def temporary_beside(path: Path) -> Path:
-    """A hidden name beside ``path`` that nobody else uses, and that tells later runs whose it is.
-
-    A process that is killed leaves its file; `check_output_folder` takes it away once that process is gone.
-    """
-    # A token, not a fixed name: workers of one experiment may write the same file at the same time.
-    token = f"{_machine()}-{os.getpid()}-{secrets.token_hex(4)}"
-    return path.with_name(f".{path.stem}.{token}.tmp{path.suffix}")
-
-
-_TEMPORARY = re.compile(r"\..*\.([0-9a-f]{8})-(\d+)-[0-9a-f]{8}\.tmp(\..*)?", re.DOTALL)
-
-
-def _machine() -> str:
-    """Eight characters that differ between machines that share a disk: processes of others cannot be looked up."""
-    return f"{zlib.crc32(platform.node().encode('utf-8', 'surrogateescape')):08x}"
-
-
-def _remove_left_behind(folder: Path) -> None:
-    """Remove temporary files of processes of this machine that have died."""
-    for entry in list(folder.iterdir()):
-        found = _TEMPORARY.fullmatch(entry.name)
-        if found is not None and found[1] == _machine() and not _lives(int(found[2])):
-            if entry.is_dir() and not entry.is_symlink():
-                shutil.rmtree(entry, ignore_errors=True)
-            else:
-                entry.unlink(missing_ok=True)
-
-
-def _lives(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except OSError:
-        # Somebody else's, or a system that does not tell.
-        return True
-    return True
 
 
 @contextmanager
@@ -228,7 +184,7 @@ def check_output_folder(path: str | os.PathLike[str]) -> Path:
     folder = Path(path)
     with output_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        _remove_left_behind(folder)
+        remove_left_behind(folder)
         probe = temporary_beside(folder / "probe")
         try:
             # Some bytes, because an empty file still fits on a full disk.

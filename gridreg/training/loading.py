@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,11 +13,13 @@ from gridreg.errors import InputError
 from gridreg.fields import import_modules, make_field
 from gridreg.rendering import Ensemble, Model, OccupancyGrid
 from gridreg.scenes import IN_PLACE, World
-from gridreg.training.checkpoint import has_checkpoint, load_checkpoint
+from gridreg.scenes.gate import check_extent
+from gridreg.scenes.views import background_colour
+from gridreg.training.checkpoint import has_checkpoint, load_checkpoint, sound
 from gridreg.training.config import from_data
 from gridreg.training.events import march_of
 from gridreg.training.rays import NdcWarp
-from gridreg.training.run import regularizers_of
+from gridreg.training.run import check_grid, regularizers_of
 from gridreg.training.settings import RunConfig
 from gridreg.training.trainer import load_field
 
@@ -69,8 +72,9 @@ def members_in(path: Path) -> tuple[list[dict[str, Any]], bool, str]:
         InputError: of `load_checkpoint`.
     """
     saved = load_checkpoint(path)
-    if "members" in saved.state:
-        return list(saved.state["members"]), True, saved.fingerprint
+    with sound(path):
+        if "members" in saved.state:
+            return list(saved.state["members"]), True, saved.fingerprint
     return [{"config": saved.config, "state": saved.state}], False, saved.fingerprint
 
 
@@ -85,8 +89,9 @@ def load_run(folder: str | Path) -> LoadedRun:
     """
     path = checkpoint_of(folder)
     members, joined, fingerprint = members_in(path)
-    runs = [_run(member["config"], member["state"], fingerprint, path) for member in members]
-    return ensemble_of(runs) if joined else runs[0]
+    with sound(path):
+        runs = [_run(member["config"], member["state"], fingerprint, path) for member in members]
+        return ensemble_of(runs) if joined else runs[0]
 
 
 def ensemble_of(runs: Sequence[LoadedRun]) -> LoadedRun:
@@ -118,6 +123,9 @@ def _run(plain: Any, state: dict[str, Any], fingerprint: str, path: Path) -> Loa
     import_modules(config.modules, str(path), never=folder)
     trainer = state["trainer"]
     bounds, resolution = trainer["field"]["bounds"], tuple(trainer["resolution"]) or (128,) * 3
+    near, far = float(state["march"]["near"]), float(state["march"]["far"])
+    check_extent(near, far, bounds)
+    check_grid(config, math.prod(resolution))
     field = make_field(config.backbone, bounds, resolution, **config.field)
     load_field(field, trainer)
     # Masks that are not yet open are part of what was trained.
@@ -127,16 +135,26 @@ def _run(plain: Any, state: dict[str, Any], fingerprint: str, path: Path) -> Loa
     field.eval()
     return LoadedRun(
         field=field,
-        occupancy=OccupancyGrid(**trainer["occupancy"]),
-        march=march_of(field, config.train, state["march"]["near"], state["march"]["far"]),
-        background=state["background"],
+        occupancy=OccupancyGrid.restored(trainer["occupancy"]),
+        march=march_of(field, config.train, near, far),
+        background=background_colour(state["background"]),
         handle=handle,
         warp=_saved_warp(state.get("warp")),
         config=config,
         step=int(trainer["step"]),
         fingerprint=fingerprint,
-        world=World(tuple(saved["origin"]), saved["unit"]) if (saved := state.get("world")) else IN_PLACE,
+        world=_saved_world(state.get("world")),
     )
+
+
+def _saved_world(saved: dict[str, Any] | None) -> World:
+    if saved is None:
+        return IN_PLACE
+    x, y, z = map(float, saved["origin"])
+    unit = float(saved["unit"])
+    if not (all(map(math.isfinite, (x, y, z))) and 0 < unit < math.inf):
+        raise ValueError(f"a world of origin {(x, y, z)} and unit {unit}")
+    return World((x, y, z), unit)
 
 
 def _saved_warp(saved: dict[str, Any] | None) -> NdcWarp | None:

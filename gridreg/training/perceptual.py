@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Literal, NamedTuple, get_args
 
 import safetensors.torch
@@ -27,6 +26,7 @@ from safetensors import SafetensorError
 from torch import Tensor
 
 from gridreg.errors import InputError
+from gridreg.scenes.files import read_bytes
 
 __all__ = ["InputRange", "Lpips", "Network", "read_lpips"]
 
@@ -197,9 +197,7 @@ def read_lpips(
         InputError: if the file cannot be read, is no safetensors file, or holds other weights.
     """
     try:
-        weights = safetensors.torch.load(Path(path).read_bytes())
-    except OSError as error:
-        raise InputError(f"{os.fspath(path)}: cannot read the LPIPS weights: {error.strerror}") from error
+        weights = safetensors.torch.load(read_bytes(path, "LPIPS weights"))
     except SafetensorError as error:
         raise InputError(f"{os.fspath(path)}: not a safetensors file with LPIPS weights") from error
     try:

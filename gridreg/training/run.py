@@ -16,7 +16,7 @@ from gridreg.errors import InputError
 from gridreg.fields import make_field
 from gridreg.machine import check_memory
 from gridreg.scenes import IN_PLACE, Scene, builtin_scene, default_protocol, load_scene
-from gridreg.training.checkpoint import load_checkpoint, save_checkpoint
+from gridreg.training.checkpoint import load_checkpoint, save_checkpoint, sound
 from gridreg.training.config import to_data
 from gridreg.training.events import carved_box, resolution_of
 from gridreg.training.settings import RunConfig
@@ -24,6 +24,7 @@ from gridreg.training.trainer import Trainer
 
 __all__ = [
     "build_trainer",
+    "check_grid",
     "check_size",
     "open_scene",
     "regularizers_of",
@@ -62,6 +63,23 @@ def regularizers_of(config: RunConfig) -> list[Regularizer]:
     return list(gridreg.from_config(config.composition))
 
 
+def check_grid(config: RunConfig, voxels: int) -> None:
+    """Refuse a grid of a configuration that the memory cannot hold.
+
+    Args:
+        config: names field and channels.
+        voxels: of the grid.
+
+    Raises:
+        InputError: naming how much it takes at the least.
+    """
+    counts = (value for name, value in config.field.items() if name.endswith("components"))
+    channels = sum(value for value in counts if isinstance(value, int)) or 16
+    # Three planes or lines of so many channels, with their gradients and two moments.
+    values = 3 * channels * float(voxels) ** (2 / 3 if config.backbone == "vm" else 1 / 3)
+    check_memory(16 * values, f"train.voxels_start, train.voxels_end: {channels} channels of {voxels} voxels")
+
+
 def check_size(config: RunConfig) -> None:
     """Refuse a configuration that needs more memory than there is.
 
@@ -70,12 +88,7 @@ def check_size(config: RunConfig) -> None:
     """
     settings = config.train
     check_memory(400 * settings.rays, f"train.rays={settings.rays}")
-    if config.backbone == "vm":
-        # Three planes of at least 16 components, with their gradients and two moments.
-        voxels = max(settings.voxels_start, settings.voxels_end)
-        check_memory(
-            768 * voxels ** (2 / 3), f"train.voxels_start, train.voxels_end: a grid of {voxels} voxels"
-        )
+    check_grid(config, max(settings.voxels_start, settings.voxels_end))
 
 
 def build_trainer(config: RunConfig, scene: Scene) -> Trainer:
@@ -129,11 +142,12 @@ def resume_trainer(
         raise InputError(
             f"{folder}: an ensemble, which cannot be trained; resume its members in their own folders"
         )
-    theirs, ours = dict(saved.config), dict(to_data(config))
-    # Where the scene lies and how often to save do not change what is computed.
-    for plain in (theirs, ours):
-        plain.pop("scene", None)
-        plain["train"] = {k: v for k, v in plain["train"].items() if k != "checkpoint_minutes"}
+    with sound(folder):
+        theirs, ours = dict(saved.config), dict(to_data(config))
+        # Where the scene lies and how often to save do not change what is computed.
+        for plain in (theirs, ours):
+            plain.pop("scene", None)
+            plain["train"] = {k: v for k, v in plain["train"].items() if k != "checkpoint_minutes"}
     if theirs != ours:
         different = sorted(key for key in {*theirs, *ours} if theirs.get(key) != ours.get(key))
         raise InputError(
@@ -141,5 +155,6 @@ def resume_trainer(
             "resume with the configuration it was started with, or choose another output folder"
         )
     trainer = make(config, scene)
-    trainer.load_state_dict(saved.state["trainer"])
-    return trainer, saved.state["record"]
+    with sound(folder):
+        trainer.load_state_dict(saved.state["trainer"])
+        return trainer, saved.state["record"]

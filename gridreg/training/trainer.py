@@ -261,14 +261,26 @@ class Trainer:
         self.generator.set_state(state["generator"])
         if "average" in state:
             self.average.load_state_dict(state["average"])
-        self.space.occupancy = OccupancyGrid(**state["occupancy"])
+        self.space.occupancy = OccupancyGrid.restored(state["occupancy"])
         self.bank.active = state["active"]
         self.bank.waiting = state.get("waiting", self.bank.active[:0])
 
 
 def load_field(field: nn.Module, state: dict[str, Any], handle: gridreg.Handle | None = None) -> None:
-    """Bring a field to the grid sizes and values of a checkpoint's state, past what ``handle`` has attached to it."""
+    """Bring a field to the grid sizes and values of a checkpoint's state, past what ``handle`` has attached to it.
+
+    Raises:
+        InputError: for grids larger than any tensor of the state, or values that are not finite.
+    """
+    longest = max((max(value.shape, default=1) for value in state["field"].values()), default=1)
     if state["resolution"]:
+        if not all(0 < edge <= longest for edge in state["resolution"]):
+            raise InputError(
+                f"checkpoint: found a grid of {state['resolution']}, expected what its tensors hold"
+            )
         with nullcontext() if handle is None else handle.suspended():
             field.resample(tuple(state["resolution"]))  # type: ignore[operator]
+    for name, value in state["field"].items():
+        if not bool(torch.isfinite(value).all()):
+            raise InputError(f"checkpoint: {name} is not finite; expected numbers")
     field.load_state_dict(state["field"])

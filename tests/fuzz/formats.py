@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import trimesh
 from hypothesis import strategies as st
 from PIL import Image
 
@@ -23,7 +24,7 @@ from gridreg.scenes import Scene, default_protocol, load_scene
 from gridreg.scenes.images import read_mask, read_rgba
 from gridreg.training.strict_yaml import read_yaml
 
-__all__ = ["Input", "inputs"]
+__all__ = ["Input", "changed_bytes", "changed_json", "changed_words", "images", "scene_inputs"]
 
 EDGE = 12
 NUMBERS = st.one_of(
@@ -71,6 +72,34 @@ def image(k: int, mode: str = "RGBA", kind: str = "PNG", **options: Any) -> byte
     values[..., 3] = 255 * (values[..., 3] > 99)
     stream = io.BytesIO()
     Image.fromarray(values).convert(mode).save(stream, kind, **options)
+    return stream.getvalue()
+
+
+def chunk(kind: bytes, data: bytes) -> bytes:
+    """Return a chunk of a PNG with its checksum."""
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
+def deep_image(colours: int, edge: int = EDGE) -> bytes:
+    """Return a PNG of 16 bits a channel, RGB (2) or RGBA (6)."""
+    rows = np.random.default_rng(colours).integers(
+        0, 256, (edge, 1 + edge * (6 if colours == 2 else 8)), np.uint8
+    )
+    rows[:, 0] = np.arange(edge) % 5
+    parts = [
+        (b"IHDR", struct.pack(">IIBBBBB", edge, edge, 16, colours, 0, 0, 0)),
+        (b"IDAT", zlib.compress(rows.tobytes())),
+        (b"IEND", b""),
+    ]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(chunk(*part) for part in parts)
+
+
+def white_square(kind: str) -> bytes:
+    """Return a mask."""
+    values = np.zeros((EDGE, EDGE), np.uint8)
+    values[3:8, 3:8] = 255
+    stream = io.BytesIO()
+    Image.fromarray(values).save(stream, kind)
     return stream.getvalue()
 
 
@@ -124,6 +153,16 @@ def changed_bytes(draw: st.DrawFn, data: bytes) -> bytes:
     return bytes(spoiled + spoiled[:40] if not draw(st.integers(0, 9)) else spoiled)
 
 
+def resealed(data: bytes) -> bytes:
+    """Return a PNG with right checksums, so that what is damaged reaches the decoder; other data as they are."""
+    parts, place = [data[:8]], 8
+    while data[:4] == b"\x89PNG" and len(data) >= place + 8:
+        length = int.from_bytes(data[place : place + 4], "big")
+        parts.append(chunk(data[place + 4 : place + 8], data[place + 8 : place + 8 + length]))
+        place += 12 + length
+    return b"".join(parts) if len(parts) > 1 else data
+
+
 @st.composite
 def changed_words(draw: st.DrawFn, text: str) -> bytes:
     """Draw a text of which some words are others, or lines are gone."""
@@ -160,6 +199,15 @@ PLY = (
     b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
     b"element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
 )
+
+
+_TRIANGLES = trimesh.creation.box((1.0, 2.0, 3.0))
+_TRIANGLES.visual.vertex_colors = np.full((8, 4), 99, np.uint8)
+MESHES = [
+    ("ply", PLY),
+    *((kind, _TRIANGLES.export(file_type=kind)) for kind in ("ply", "stl", "stl_ascii", "obj", "off", "glb")),
+]
+MESHES = [(kind.partition("_")[0], data.encode() if isinstance(data, str) else data) for kind, data in MESHES]
 
 
 @st.composite
@@ -241,8 +289,7 @@ def headers(draw: st.DrawFn) -> bytes:
         parts.insert(1, (b"tRNS", draw(st.binary(max_size=8))))
     if draw(st.booleans()):
         parts.insert(1, (b"eXIf", draw(st.binary(max_size=40))))
-    coded = [struct.pack(">I", len(d)) + k + d + struct.pack(">I", zlib.crc32(k + d)) for k, d in parts]
-    return b"\x89PNG\r\n\x1a\n" + b"".join(coded)
+    return b"\x89PNG\r\n\x1a\n" + b"".join(chunk(*part) for part in parts)
 
 
 @st.composite
@@ -255,23 +302,22 @@ def images(draw: st.DrawFn) -> Input:
                 image(0, "LA"),
                 image(0, "P"),
                 image(0, "1"),
+                *(white_square(kind) for kind in ("PNG", "TIFF", "BMP", "JPEG")),
                 image(0, "L"),
-                image(
-                    0,
-                    "RGB",
-                    "JPEG",
-                    exif=SIDEWAYS,
-                ),
+                image(0, "RGB", "JPEG", exif=SIDEWAYS),
                 image(0, "RGBA", "WEBP"),
                 image(0, "F", "TIFF"),
                 image(0, "RGB", "TIFF"),
                 image(0, "RGB", "BMP"),
                 image(0, "RGB", "EPS"),
                 image(0, "RGB", "GIF"),
+                image(0, "I;16"),
+                deep_image(2),
+                deep_image(6),
             ]
         )
     )
-    data = draw(st.one_of(changed_bytes(whole), headers()))
+    data = draw(st.one_of(changed_bytes(whole), changed_bytes(whole).map(resealed), headers()))
     if draw(st.booleans()):
         return Input("mask", {"a.png": data}, lambda folder: read_mask(folder / "a.png"))
     return Input("image", {"a.png": data}, lambda folder: read_rgba(folder / "a.png", opaque=True))
@@ -290,8 +336,7 @@ def camera_files(draw: st.DrawFn) -> Input:
 @st.composite
 def meshes(draw: st.DrawFn) -> Input:
     """Draw a mesh file."""
-    suffix = draw(st.sampled_from(["ply", "obj", "stl", "off", "glb"]))
-    text = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n" if suffix == "obj" else PLY
+    suffix, text = draw(st.sampled_from(MESHES))
     return Input(
         "mesh", {f"a.{suffix}": draw(changed_bytes(text))}, lambda folder: read_mesh(folder / f"a.{suffix}")
     )
@@ -306,17 +351,16 @@ def configurations(draw: st.DrawFn) -> Input:
     return Input("YAML", {"a.yaml": text}, lambda folder: read_yaml(folder / "a.yaml"))
 
 
-def inputs() -> st.SearchStrategy[Input]:
-    """Return a strategy over all formats."""
-    return st.one_of(
+def scene_inputs() -> list[st.SearchStrategy[Input]]:
+    """Return a strategy for each format of scenes, images, meshes and camera paths."""
+    return [
         single_lists(),
         blender_lists(),
         colmap_texts(),
         colmap_binaries(),
         llff_arrays(),
         images(),
-        images(),
         camera_files(),
         meshes(),
         configurations(),
-    )
+    ]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import tempfile
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -17,8 +16,10 @@ from PIL import Image
 from torch import Tensor
 
 from gridreg.errors import InputError
+from gridreg.machine import remove_left_behind, temporary_beside
 from gridreg.scenes.builtin.cameras import FIELD_OF_VIEW, test_poses, train_poses
 from gridreg.scenes.builtin.raycast import cast, render_rgba
+from gridreg.scenes.files import read_json
 from gridreg.scenes.load import BUILTIN_MARKER
 
 __all__ = ["builtin_depth", "builtin_scene", "write_once"]
@@ -74,23 +75,23 @@ def write_once(
         raise InputError(
             f"{target}: exists but is not the built-in scene; move it away or choose another folder"
         )
-    scratch: str | None = None
+    scratch = temporary_beside(target)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        scratch = tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent)
-        fresh = Path(scratch) / "scene"
+        remove_left_behind(target.parent)
+        scratch.mkdir()
+        fresh = scratch / "scene"
         write(fresh)
         _write_json(fresh / BUILTIN_MARKER, marker)
         if target.exists():
-            target.rename(Path(scratch) / "old")
+            target.rename(scratch / "old")
         fresh.rename(target)
     except OSError as error:
         # Another process may have finished the same scene in the meantime.
         if not _is_complete(target, marker, needed):
             raise InputError(f"{target}: the built-in scene cannot be written ({error.strerror})") from None
     finally:
-        if scratch is not None:
-            shutil.rmtree(scratch, ignore_errors=True)
+        shutil.rmtree(scratch, ignore_errors=True)
     return target
 
 
@@ -129,8 +130,8 @@ def _marker(size: int) -> dict[str, object]:
 
 def _is_complete(target: Path, marker: dict[str, object], needed: list[str]) -> bool:
     try:
-        found = json.loads((target / BUILTIN_MARKER).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        found = read_json(target / BUILTIN_MARKER)
+    except InputError:
         return False
     return bool(found == marker) and all((target / name).is_file() for name in needed)
 
