@@ -1,11 +1,14 @@
 """What a composition gains on fields of other people's, and what it costs: a bare field beside one with gridreg.
 
-    python benchmarks/foreign.py --data DIR --scenes builtin lego --fields tensorf kplanes hash mlp --seeds 0 1 2
+    python benchmarks/foreign.py choose --data DIR --scenes builtin lego --steps 200
+    python benchmarks/foreign.py compare --data DIR --scenes builtin lego --seeds 0 1 2
 
 The fields are nerfstudio's TensoRFField, NerfactoField (hash grid, its torch implementation) and NeRFField, and
-K-Planes as `kplanes-nerfstudio` has it; needs both packages. Each is trained twice from the same start, in turns, one
-step of the one and one of the other, in a loop that knows of gridreg only `handle.step` and `handle.loss`. With
-`--candidates`, all compositions are scored on validation views instead of the chosen one on test views.
+K-Planes as `kplanes-nerfstudio` has it; needs both packages. Fields that are compared start alike and see the same
+rays, in turns, a step of the one and a step of the other, in a loop that knows of gridreg only `handle.step`,
+`handle.background` and `handle.loss`. `choose` scores pieces alone on validation views (seed 0), then those together
+that gained; `compare` scores the best of all, in the mean of the scenes, on test views. Seconds are of processor
+time, so other programs do not count; give it one thread.
 """
 
 from __future__ import annotations
@@ -21,7 +24,7 @@ from pathlib import Path
 
 import stored
 import torch
-from foreign_fields import compositions, make
+from foreign_fields import composition, make, pieces
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -32,27 +35,27 @@ from gridreg.scenes import Scene, builtin_scene, load_scene
 from gridreg.training.versions import versions
 
 STUDY = "foreign"
-SIZE, RAYS, SAMPLES = 100, 384, 64
+SIZE, RAYS, SAMPLES, STEPS = 100, 192, 32, 400
 FIELDS = ("tensorf", "kplanes", "hash", "mlp")
+BARE = "bare"
 
 
 class Training:
     """A field, its optimizer and its handle; one step at a time."""
 
-    def __init__(self, name: str, composition: str | None, scene: Scene, steps: int, seed: int) -> None:
-        self.foreign, self.scene, self.steps = make(name, scene.bounds, seed), scene, steps
+    def __init__(self, field: str, name: str, scene: Scene, steps: int, seed: int) -> None:
+        self.foreign, self.scene, self.steps = make(field, scene.bounds, seed), scene, steps
         self.generator = torch.Generator().manual_seed(seed)
-        regularizers = [] if composition is None else compositions(self.foreign)[composition]
-        self.handle = (
-            gridreg.apply(self.foreign.field, *regularizers, total_steps=steps) if regularizers else None
-        )
+        self.regularizers = [] if name == BARE else composition(self.foreign, name)
+        self.handle = None
+        if self.regularizers:
+            self.handle = gridreg.apply(self.foreign.field, *self.regularizers, total_steps=steps)
         self.optimizer = self._optimizer()
         views = scene.train
         rays = [camera_rays(p, k, SIZE, SIZE) for p, k in zip(views.poses, views.intrinsics, strict=True)]
-        self.origins, self.directions = (
-            torch.cat([getattr(r, key) for r in rays]) for key in ("origins", "directions")
-        )
-        self.target = views.composited(scene.background).reshape(-1, 3)
+        self.origins = torch.cat([r.origins for r in rays])
+        self.directions = torch.cat([r.directions for r in rays])
+        self.rgba = views.rgba.reshape(-1, 4)
         self.seconds: list[float] = []
 
     def _optimizer(self) -> torch.optim.Optimizer:
@@ -65,20 +68,19 @@ class Training:
         )
 
     def render(
-        self, origins: Tensor, directions: Tensor, jitter: Tensor | float
+        self, rays: tuple[Tensor, Tensor], jitter: Tensor | float, background: Tensor, alpha: Tensor | None
     ) -> tuple[Tensor, gridreg.RaySamples]:
         """Colours `(R, 3)` and the samples of rays, at equal distances inside the box."""
-        rays = types.SimpleNamespace(origins=origins, directions=directions)
-        start, end = box_intersection(rays, self.scene.bounds, self.scene.near, self.scene.far)  # type: ignore[arg-type]
+        origins, directions = rays
+        both = types.SimpleNamespace(origins=origins, directions=directions)
+        start, end = box_intersection(both, self.scene.bounds, self.scene.near, self.scene.far)  # type: ignore[arg-type]
         delta = ((end - start).clamp_min(0) / SAMPLES)[:, None].expand(-1, SAMPLES)
         t = start[:, None] + (torch.arange(SAMPLES) + jitter) * delta
         density, colour = self.query(origins[:, None] + t[..., None] * directions[:, None], directions)
-        samples = gridreg.RaySamples.from_dense(t, delta, density)
+        samples = gridreg.RaySamples.from_dense(t, delta, density, target_opacity=alpha)
         weights = samples.weights.view_as(t)
-        colour = (weights[..., None] * colour).sum(1) + (
-            1 - weights.sum(1, keepdim=True)
-        ) * self.scene.background
-        return colour, samples
+        left = 1 - weights.sum(1, keepdim=True)
+        return (weights[..., None] * colour).sum(1) + left * background, samples
 
     def query(self, x: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
         """Density `(R, S)` and colour `(R, S, 3)` at positions `(R, S, 3)`, by the field's own way of being called."""
@@ -92,18 +94,21 @@ class Training:
 
     def step(self, step: int) -> None:
         """Train on one batch; grids that grow do so at a quarter and at half of the run."""
-        begin = time.perf_counter()
+        begin = time.process_time()
         if self.foreign.grow and step in (self.steps // 4, self.steps // 2):
             with self.handle.suspended() if self.handle else torch.no_grad():
                 for name in self.foreign.grow:
                     self.foreign.field.get_submodule(name).upsample_grid(72 if step < self.steps // 2 else 96)
             self.optimizer = self._optimizer()
         chosen = torch.randint(len(self.origins), (RAYS,), generator=self.generator)
+        jitter = torch.rand(RAYS, 1, generator=self.generator)
+        background, rgba = self.scene.background, self.rgba[chosen]
         if self.handle:
             self.handle.step(step)
-        jitter = torch.rand(RAYS, 1, generator=self.generator)
-        colour, samples = self.render(self.origins[chosen], self.directions[chosen], jitter)
-        loss = F.mse_loss(colour, self.target[chosen])
+            background = self.handle.background(RAYS, self.generator, background)
+        rays = self.origins[chosen], self.directions[chosen]
+        colour, samples = self.render(rays, jitter, background, rgba[:, 3])
+        loss = F.mse_loss(colour, background + rgba[:, 3:] * (rgba[:, :3] - background))
         if self.handle:
             loss = loss + self.handle.loss(samples)
         for group in self.optimizer.param_groups:
@@ -111,122 +116,138 @@ class Training:
         self.optimizer.zero_grad()
         loss.backward()
         self.optimizer.step()
-        self.seconds.append(time.perf_counter() - begin)
+        self.seconds.append(time.process_time() - begin)
 
     @torch.no_grad()
-    def psnr(self, split: str) -> float:
-        """Mean over at most eight views, evenly spread, dB."""
+    def psnr(self, split: str) -> list[float]:
+        """Of at most eight views, evenly spread, every second pixel of every second row, dB."""
         views, found = getattr(self.scene, split), []
+        targets = views.composited(self.scene.background)
         for i in range(0, len(views), -(-len(views) // 8)):
-            pose, intrinsics = views.poses[i], views.intrinsics[i]
-            target = views.composited(self.scene.background)[i]
-            rays = camera_rays(pose, intrinsics, SIZE, SIZE)
-            chunks = zip(rays.origins.split(2048), rays.directions.split(2048), strict=True)
-            image = torch.cat([self.render(*chunk, 0.5)[0] for chunk in chunks]).clamp(0, 1)
-            found.append(-10 * float(F.mse_loss(image, target.reshape(-1, 3)).log10()))
-        return statistics.fmean(found)
+            rays = camera_rays(views.poses[i], views.intrinsics[i], SIZE, SIZE)
+            both = [x.view(SIZE, SIZE, 3)[::2, ::2].reshape(-1, 3) for x in (rays.origins, rays.directions)]
+            chunks = zip(*(x.split(512) for x in both), strict=True)
+            image = [self.render(chunk, 0.5, self.scene.background, None)[0] for chunk in chunks]
+            error = F.mse_loss(torch.cat(image).clamp(0, 1), targets[i, ::2, ::2].reshape(-1, 3))
+            found.append(-10 * float(error.log10()))
+        return found
 
 
 def open_scene(name: str, data: Path | None) -> Scene:
     """The built-in scene or one of ``data``, at 100x100, with validation views."""
     if name == "builtin":
         folder = builtin_scene(Path(tempfile.gettempdir()) / f"gridreg-builtin-{SIZE}", size=SIZE)
-        return load_scene(folder, "builtin8", validation=6)
+        return load_scene(folder, "builtin8", validation=4)
     if data is None:
         raise gridreg.InputError(f"--scenes {name}: expected --data, the folder that holds it")
-    return load_scene(data / name, "dietnerf8", size=SIZE, validation=6)
+    return load_scene(data / name, "dietnerf8", size=SIZE, validation=4)
 
 
-def compare(
-    name: str, composition: str, scene: Scene, label: str, seed: int, options: argparse.Namespace
+def train(
+    names: Sequence[str], split: str, field: str, label: str, seed: int, options: argparse.Namespace
 ) -> None:
-    """Train the pair, and store it, unless it is stored already."""
-    split = "validation" if options.candidates else "test"
-    key = f"{label}-{name}-{composition}-{split}-seed{seed}" + (
-        "" if options.steps == 600 else f"-{options.steps}steps"
-    )
-    if stored.find(STUDY, key, options.results):
+    """Train a field bare and with each composition that has no record yet, in turns, and store what they gain."""
+    length = "" if options.steps == STEPS else f"-{options.steps}steps"
+    keys = {name: f"{label}-{field}-{name}-{split}-seed{seed}{length}" for name in names}
+    names = [name for name in names if not stored.find(STUDY, keys[name], options.results)]
+    if not names:
         return
-    pair = [Training(name, chosen, scene, options.steps, seed) for chosen in (None, composition)]
+    scene = open_scene(label, options.data)
+    trainings = {name: Training(field, name, scene, options.steps, seed) for name in (BARE, *names)}
     for step in range(options.steps):
-        for training in pair if step % 2 else reversed(pair):
+        for training in list(trainings.values())[:: 1 if step % 2 else -1]:
             training.step(step)
-    bare, attached = (training.psnr(split) for training in pair)
-    first, second = (statistics.median(training.seconds) for training in pair)
-    record = {
-        "scene": label,
-        "field": name,
-        "composition": composition,
-        "regularizers": gridreg.to_config(compositions(pair[1].foreign)[composition]),
-        "split": split,
-        "seed": seed,
-        "steps": options.steps,
-        "psnr": {"bare": bare, "attached": attached},
-        "step_seconds": {"bare": first, "attached": second},
-        "versions": versions(),
-        "command": [
-            "benchmarks/foreign.py",
-            "--data",
-            "DIR",
-            "--scenes",
-            label,
-            "--fields",
-            name,
-            "--seeds",
-            str(seed),
-        ]
-        + (["--candidates"] if options.candidates else [])
-        + ([] if options.steps == 600 else ["--steps", str(options.steps)]),
-    }
-    stored.save(STUDY, key, record, options.results)
-    print(f"{key}: {bare:.2f} -> {attached:.2f} dB, step {100 * (second / first - 1):+.0f} %", flush=True)
+    psnr = {name: training.psnr(split) for name, training in trainings.items()}
+    seconds = {name: statistics.median(training.seconds) for name, training in trainings.items()}
+    for name in names:
+        record = {
+            "scene": label,
+            "field": field,
+            "composition": name,
+            "regularizers": gridreg.to_config(trainings[name].regularizers),
+            "split": split,
+            "seed": seed,
+            "steps": options.steps,
+            "psnr": {"bare": psnr[BARE], "attached": psnr[name]},
+            "step_seconds": {"bare": seconds[BARE], "attached": seconds[name]},
+            "versions": versions(),
+            "command": stored.command_line("benchmarks/foreign.py"),
+        }
+        stored.save(STUDY, keys[name], record, options.results)
+        gain, cost = mean_gain(record), 100 * (seconds[name] / seconds[BARE] - 1)
+        bare = statistics.fmean(psnr[BARE])
+        print(f"{keys[name]}: {bare:.2f} dB bare, {gain:+.2f} dB; step {cost:+.0f} %", flush=True)
 
 
-def chosen(name: str, results: Path) -> str:
-    """Return the composition that gained most on validation views, in the mean of what `--candidates` stored.
+def mean_gain(record: stored.Record) -> float:
+    """Mean over the images, dB."""
+    psnr = record["psnr"]
+    return statistics.fmean(a - b for a, b in zip(psnr["attached"], psnr["bare"], strict=True))
+
+
+def gains(field: str, options: argparse.Namespace) -> dict[str, list[float]]:
+    """Gains on validation views by composition, dB: one for each scene, after however many steps."""
+    found: dict[str, list[float]] = {}
+    for record in stored.load(STUDY, options.results):
+        if (record["field"], record["split"]) == (field, "validation"):
+            found.setdefault(record["composition"], []).append(mean_gain(record))
+    return found
+
+
+def together(found: dict[str, list[float]]) -> list[str]:
+    """Pieces that gained, joined: those that did in the mean, and those that did on every scene.
+
+    Of each kind of piece the better strength.
+    """
+    best: dict[str, str] = {}
+    for name in sorted(found, key=lambda name: statistics.fmean(found[name])):
+        if "+" not in name:
+            best[name.partition(":")[0]] = name
+    means = [name for name in best.values() if statistics.fmean(found[name]) > 0]
+    every = [name for name in means if min(found[name]) > 0]
+    return list(dict.fromkeys("+".join(sorted(names)) for names in (means, every) if len(names) > 1))
+
+
+def chosen(field: str, options: argparse.Namespace) -> str:
+    """Return the composition that gained most on validation views, in the mean of the scenes.
 
     Raises:
         InputError: if nothing is stored for this field.
     """
-    gains: dict[str, list[float]] = {}
-    for record in stored.load(STUDY, results):
-        if record["field"] == name and record["split"] == "validation":
-            gains.setdefault(record["composition"], []).append(
-                record["psnr"]["attached"] - record["psnr"]["bare"]
-            )
-    if not gains:
-        raise gridreg.InputError(
-            f"--fields {name}: no composition is chosen yet; run with --candidates first"
-        )
-    return max(gains, key=lambda composition: statistics.fmean(gains[composition]))
+    found = gains(field, options)
+    if not found:
+        raise gridreg.InputError(f"--fields {field}: no composition is chosen yet; run `choose` first")
+    return max(found, key=lambda name: statistics.fmean(found[name]))
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Parse the command line, and compare."""
+    """Parse the command line, and choose or compare."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
+    parser.add_argument("do", choices=("choose", "compare"))
     parser.add_argument("--data", type=Path, help="folder that holds the scenes")
     parser.add_argument("--scenes", nargs="+", default=["builtin"])
     parser.add_argument("--fields", nargs="+", choices=FIELDS, default=list(FIELDS))
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
-    parser.add_argument("--steps", type=int, default=600)
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0], help="of `compare`")
+    parser.add_argument("--steps", type=int, default=STEPS)
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
-    parser.add_argument("--candidates", action="store_true", help="all compositions, on validation views")
     parser.add_argument("--results", type=Path, default=stored.RESULTS)
     options = parser.parse_args(words)
     torch.set_num_threads(options.threads)
-    for label in options.scenes:
-        scene = open_scene(label, options.data)
-        for name in options.fields:
-            names = (
-                list(compositions(make(name, scene.bounds, 0)))
-                if options.candidates
-                else [chosen(name, options.results)]
-            )
-            for seed in options.seeds:
-                for composition in names:
-                    compare(name, composition, scene, label, seed, options)
+    if options.do == "choose":
+        for field in options.fields:
+            alone = list(pieces(make(field, torch.tensor([[-1.0] * 3, [1.0] * 3]), 0)))
+            for label in options.scenes:
+                train(alone, "validation", field, label, 0, options)
+            for label in options.scenes:
+                train(together(gains(field, options)), "validation", field, label, 0, options)
+    else:
+        names = {field: chosen(field, options) for field in options.fields}
+        for seed in options.seeds:
+            for field, name in names.items():
+                for label in options.scenes:
+                    train([name], "test", field, label, seed, options)
     return 0
 
 

@@ -18,8 +18,10 @@ class Foreign(NamedTuple):
 
     field: nn.Module
     rates: dict[str, float]  # learning rate by the beginning of a parameter's name
-    grids: tuple[Any, ...]  # raw grids, for penalties
+    grids: tuple[gridreg.Selector, ...]  # raw grids, for penalties
     masks: tuple[gridreg.Regularizer, ...]  # open from coarse to fine
+    direction: gridreg.Selector  # the encoding of the viewing direction
+    smooth: bool = True  # whether neighbours in the grids are neighbours in space
     grow: tuple[str, ...] = ()  # modules whose grids are upsampled on the way
 
 
@@ -67,6 +69,7 @@ def make(name: str, bounds: Tensor, seed: int) -> Foreign:
     from nerfstudio.fields.vanilla_nerf_field import NeRFField
 
     torch.manual_seed(seed)
+    direction = gridreg.outputs("direction_encoding", dim=-1)
     if name == "tensorf":
         grids = {
             "density_encoding": encodings.TensorVMEncoding(resolution=48, num_components=16),
@@ -88,7 +91,8 @@ def make(name: str, bounds: Tensor, seed: int) -> Foreign:
             {"density_encoding": 0.02, "color_encoding": 0.02},
             tuple(planes),
             tuple(mask),
-            tuple(grids),
+            direction,
+            grow=tuple(grids),
         )
     if name == "kplanes":
         stub_tinycudann()
@@ -99,7 +103,7 @@ def make(name: str, bounds: Tensor, seed: int) -> Foreign:
         )
         grid = gridreg.parameters("grids.*.plane_coefs.*", dim=0)
         mask = gridreg.FrequencyMask(gridreg.outputs("grids.*", dim=-1), until=0.5)
-        return Foreign(field, {"grids": 0.02}, (grid,), (mask,))
+        return Foreign(field, {"grids": 0.02}, (grid,), (mask,), direction)
     if name == "hash":
         field = NerfactoField(
             bounds,
@@ -111,8 +115,9 @@ def make(name: str, bounds: Tensor, seed: int) -> Foreign:
             implementation="torch",
         )
         levels = gridreg.outputs("mlp_base.model.0", dim=-1)
+        table = gridreg.parameters("mlp_base.model.0.hash_table", dim=1)
         mask = gridreg.LevelMask(levels, start=4, every=100, features=2)
-        return Foreign(field, {"mlp_base.model.0": 0.01}, (), (mask,))
+        return Foreign(field, {"mlp_base.model.0": 0.01}, (table,), (mask,), direction, smooth=False)
     octaves = gridreg.octaves_of_channels(3, 8, order="coordinate", include_input="last")
     field = NeRFField(
         position_encoding=encodings.NeRFEncoding(
@@ -121,23 +126,33 @@ def make(name: str, bounds: Tensor, seed: int) -> Foreign:
         direction_encoding=encodings.NeRFEncoding(
             in_dim=3, num_frequencies=2, min_freq_exp=0, max_freq_exp=1, include_input=True
         ),
-        base_mlp_num_layers=4,
-        base_mlp_layer_width=128,
+        base_mlp_num_layers=3,
+        base_mlp_layer_width=96,
         head_mlp_num_layers=1,
         head_mlp_layer_width=64,
-        skip_connections=(2,),
+        skip_connections=(1,),
     )
     mask = gridreg.FrequencyMask(gridreg.outputs("position_encoding", octaves=octaves), until=0.5)
-    return Foreign(field, {}, (), (mask,))
+    return Foreign(field, {}, (), (mask,), direction)
 
 
-def compositions(foreign: Foreign) -> dict[str, list[gridreg.Regularizer]]:
-    """Return what validation views choose from."""
-    rays = [gridreg.OcclusionLoss(weight=1e-3, distance=0.3), gridreg.DistortionLoss(weight=3e-3)]
-    smooth = [gridreg.TotalVariation(grid, weight=0.05) for grid in foreign.grids]
-    return {
-        "rays": rays,
-        "smooth": [*smooth, *rays],
-        "masked": [*smooth, *rays, *foreign.masks],
+def pieces(foreign: Foreign) -> dict[str, list[gridreg.Regularizer]]:
+    """Return what validation views choose from, each a kind of regularizer and, after a colon, how strong."""
+    found: dict[str, list[gridreg.Regularizer]] = {
+        "background": [gridreg.ExpectedBackground()],
+        "direction": [gridreg.ViewDependenceMask(foreign.direction, bands=0)],
         "mask": [*foreign.masks],
+        "occlusion:0.01": [gridreg.OcclusionLoss(weight=1e-2, distance=0.3)],
+        "distortion:0.01": [gridreg.DistortionLoss(weight=1e-2)],
     }
+    if foreign.grids and foreign.smooth:
+        for weight in (0.03, 0.3):
+            found[f"smooth:{weight:g}"] = [gridreg.TotalVariation(g, weight=weight) for g in foreign.grids]
+    elif foreign.grids:
+        found["small:0.1"] = [gridreg.L2(grid, weight=0.1) for grid in foreign.grids]
+    return found
+
+
+def composition(foreign: Foreign, name: str) -> list[gridreg.Regularizer]:
+    """Return the regularizers of one piece, or of several joined by plus signs."""
+    return [regularizer for piece in name.split("+") for regularizer in pieces(foreign)[piece]]
