@@ -146,7 +146,7 @@ def pieces(foreign: Foreign) -> dict[str, list[gridreg.Regularizer]]:
         "distortion:0.01": [gridreg.DistortionLoss(weight=1e-2)],
     }
     if foreign.grids and foreign.smooth:
-        for weight in (0.03, 0.3):
+        for weight in (1e-3, 1e-2):
             found[f"smooth:{weight:g}"] = [gridreg.TotalVariation(g, weight=weight) for g in foreign.grids]
     elif foreign.grids:
         found["small:0.1"] = [gridreg.L2(grid, weight=0.1) for grid in foreign.grids]

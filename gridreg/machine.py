@@ -1,4 +1,4 @@
-"""The machine: cores that this process may use, what fits into memory, and what dead processes have left."""
+"""The machine: its cores, its memory, its devices, and what dead processes have left."""
 
 from __future__ import annotations
 
@@ -9,10 +9,23 @@ import secrets
 import shutil
 import zlib
 from pathlib import Path
+from typing import Literal
+
+import torch
 
 from gridreg.errors import InputError
 
-__all__ = ["available_memory", "check_memory", "remove_left_behind", "temporary_beside", "usable_cores"]
+__all__ = [
+    "DeviceName",
+    "available_memory",
+    "check_memory",
+    "choose_device",
+    "remove_left_behind",
+    "temporary_beside",
+    "usable_cores",
+]
+
+DeviceName = Literal["cpu", "cuda", "mps", "auto"]
 
 _CGROUP = (
     ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
@@ -69,6 +82,29 @@ def check_memory(needed: float, what: str) -> None:
 def usable_cores() -> int:
     """Cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def choose_device(name: str, option: str = "--device") -> torch.device:
+    """Return the device of a name; "auto" is CUDA where there is one, else MPS, else the CPU.
+
+    Args:
+        name: one of `DeviceName`.
+        option: what the name was given to, for the message.
+
+    Raises:
+        InputError: it is not there.
+
+    Example:
+        >>> choose_device("cpu")
+        device(type='cpu')
+    """
+    there = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available(), "cpu": True}
+    if name == "auto":
+        name = next(known for known, found in there.items() if found)
+    if not there.get(name):
+        found = ", ".join(known for known in there if there[known])
+        raise InputError(f"{option}: found {name!r}, expected a device that is here: {found}, auto")
+    return torch.device(name)
 
 
 def temporary_beside(path: Path) -> Path:

@@ -16,7 +16,7 @@ from gridreg.ablation.runners import InProcess, Runner
 from gridreg.ablation.store import Store
 from gridreg.ablation.study import load_study
 from gridreg.errors import InputError, near_names
-from gridreg.machine import usable_cores
+from gridreg.machine import DeviceName, choose_device, usable_cores
 
 __all__ = ["AblationOptions", "make_runner", "run"]
 
@@ -37,6 +37,8 @@ class AblationOptions:
     """Runs at a time; default: as many as the cores hold with --threads each."""
     threads: int | None = None
     """Processor threads of each run; default: all with `local`, 1 otherwise."""
+    device: DeviceName = "cpu"
+    """Where runs compute, with `local` and `processes`; auto: a GPU where there is one."""
     address: str | None = None
     """Address of the Ray cluster: auto, or HOST:PORT; without it, one is started on this machine."""
     ship_scenes: bool = False
@@ -114,14 +116,17 @@ def make_runner(options: AblationOptions) -> Runner:
     if options.runner != "ray" and (options.address is not None or options.ship_scenes):
         name = "--address" if options.address is not None else "--ship-scenes"
         raise InputError(f"{name}: found with --runner {options.runner}, expected --runner ray")
+    device = str(choose_device(options.device))
+    if options.runner == "ray" and device != "cpu":
+        raise InputError(f"--device: found {device} with --runner ray, expected cpu there")
     if options.runner == "local":
         if options.workers not in (None, 1):
             raise InputError(
                 f"--workers: found {options.workers} with --runner local, expected --runner processes"
             )
-        return InProcess(options.threads, options.keep_checkpoints)
+        return InProcess(options.threads, options.keep_checkpoints, device)
     if options.runner == "processes":
-        return Processes(options.workers, options.threads or 1, options.keep_checkpoints)
+        return Processes(options.workers, options.threads or 1, options.keep_checkpoints, device)
     from gridreg.ablation.ray_runner import RayRunner
 
     return RayRunner(

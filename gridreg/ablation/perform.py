@@ -69,10 +69,11 @@ class Scenes:
 
     Args:
         cache: folder for the built-in scene.
+        device: where runs on them compute.
     """
 
-    def __init__(self, cache: Path) -> None:
-        self._cache = cache
+    def __init__(self, cache: Path, device: str = "cpu") -> None:
+        self._cache, self._device = cache, device
         self._kept: OrderedDict[tuple[Any, ...], Scene] = OrderedDict()
 
     def get(self, spec: RunSpec) -> Scene:
@@ -98,7 +99,8 @@ class Scenes:
             folder, size = builtin_scene(self._cache, size=spec.size or 200), None
         else:
             folder, size = locate_scene(spec.scene), spec.size
-        return load_scene(folder, spec.protocol, size=size, test=spec.test, opaque=_is_opaque(spec))
+        scene = load_scene(folder, spec.protocol, size=size, test=spec.test, opaque=_is_opaque(spec))
+        return scene.to(self._device)
 
 
 def scene_key(spec: RunSpec) -> tuple[Any, ...]:

@@ -44,11 +44,13 @@ class Processes:
         workers: processes; default: as many as the cores hold.
         threads: of each.
         keep_checkpoints: leave those of finished runs in their folders.
+        device: where they compute.
     """
 
     workers: int | None = None
     threads: int = 1
     keep_checkpoints: bool = True
+    device: str = "cpu"
 
     def run(self, store: Store, study: Study, report: Report) -> None:
         """See `gridreg.ablation.runners.Runner.run`."""
@@ -82,6 +84,7 @@ class Processes:
     def _start(self, store: Store, study: Study, children: dict[_Process, Worker]) -> None:
         command = [sys.executable, "-m", "gridreg.ablation.worker", "--end-with-input", "--study", study.name]
         command += ["--store", str(store.folder.resolve()), "--threads", str(self.threads)]
+        command += ["--device", self.device]
         command += [] if self.keep_checkpoints else ["--no-checkpoints"]
         variables = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
         path = os.pathsep.join(filter(None, sys.path))

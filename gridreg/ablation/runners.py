@@ -77,20 +77,28 @@ class InProcess:
     Args:
         threads: of torch; default: as they are.
         keep_checkpoints: leave those of finished runs in their folders.
+        device: where to compute.
     """
 
     threads: int | None = None
     keep_checkpoints: bool = True
+    device: str = "cpu"
 
     def run(self, store: Store, study: Study, report: Report) -> None:
         """See `Runner.run`."""
         if self.threads is not None:
             torch.set_num_threads(self.threads)
-        serve(store, study, report, keep_checkpoints=self.keep_checkpoints)
+        serve(store, study, report, keep_checkpoints=self.keep_checkpoints, device=self.device)
 
 
 def serve(
-    store: Store, study: Study, report: Report, *, keep_checkpoints: bool = True, log: bool = False
+    store: Store,
+    study: Study,
+    report: Report,
+    *,
+    keep_checkpoints: bool = True,
+    log: bool = False,
+    device: str = "cpu",
 ) -> None:
     """Claim and do one run after another until none of the study waits or is under way.
 
@@ -100,12 +108,13 @@ def serve(
         report: told what happens.
         keep_checkpoints: leave those of finished runs in their folders.
         log: what a run prints goes to its folder instead of the terminal.
+        device: where to compute.
 
     Raises:
         KeyboardInterrupt: if it was interrupted; the run under way is saved and waits.
         DiskFullError: if there is no space for results; the run under way waits.
     """
-    worker, scenes = Worker.current(), Scenes(store.folder / "scenes")
+    worker, scenes = Worker.current(), Scenes(store.folder / "scenes", device)
     while True:
         claim = store.claim(worker, study)
         if claim is None:

@@ -26,6 +26,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--store", required=True, help="folder of the store")
     parser.add_argument("--study", required=True, help="name of the study in it")
     parser.add_argument("--threads", type=int, default=1, help="processor threads")
+    parser.add_argument("--device", default="cpu", help="where to compute")
     parser.add_argument("--no-checkpoints", action="store_true", help="remove those of finished runs")
     parser.add_argument("--end-with-input", action="store_true", help="stop when standard input ends")
     options = parser.parse_args(arguments)
@@ -46,7 +47,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         store = Store.open(options.store, create=False)
         study = store.study(options.study)
         import_modules(study.modules, study.name)
-        serve(store, study, lambda event: None, keep_checkpoints=not options.no_checkpoints, log=True)
+        keep, device = not options.no_checkpoints, options.device
+        serve(store, study, lambda event: None, keep_checkpoints=keep, log=True, device=device)
     except KeyboardInterrupt:
         return 130
     except InputError as error:

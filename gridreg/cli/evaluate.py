@@ -8,6 +8,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from gridreg.cli.arguments import Checkpoint, OptionalFile, OptionalFolder
+from gridreg.machine import DeviceName, choose_device
 
 if TYPE_CHECKING:
     from gridreg.training import LoadedRun
@@ -27,6 +28,8 @@ class EvalOptions:
     """Weights of LPIPS as a safetensors file, network vgg or alex, for that distance as well; default: without it."""
     out: OptionalFolder = None
     """Folder for metrics.json, test.png, test/ (renders beside their targets) and index.html; default: the score."""
+    device: DeviceName = "cpu"
+    """Where to compute; auto: a GPU where there is one."""
 
 
 def run(options: EvalOptions) -> int:
@@ -58,7 +61,7 @@ def _score(options: EvalOptions) -> int:
     from gridreg.training.record import metrics_record, save_metrics, summary
 
     lpips = None if options.lpips is None else read_lpips(options.lpips)
-    loaded = load_run(options.checkpoint)
+    loaded = load_run(options.checkpoint, choose_device(options.device))
     scene = scene_of(loaded, options.checkpoint, options.scene)
     folder = None if options.out is None else check_output_folder(options.out / "test")
     if loaded.step < loaded.config.train.steps:

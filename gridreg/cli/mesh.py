@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from gridreg.cli.arguments import Checkpoint, OptionalFile, OptionalFloat, OptionalInt
+from gridreg.machine import DeviceName, choose_device
 
 __all__ = ["MeshOptions", "run"]
 
@@ -27,6 +28,8 @@ class MeshOptions:
     """At most so many faces, such as 100000; default: as many as the resolution gives."""
     colours: bool = True
     """Colour the vertices as the field is seen along its normals."""
+    device: DeviceName = "cpu"
+    """Where to compute; auto: a GPU where there is one."""
 
 
 def run(options: MeshOptions) -> int:
@@ -41,7 +44,7 @@ def run(options: MeshOptions) -> int:
     from gridreg.export import write_mesh
     from gridreg.training import load_run
 
-    loaded = load_run(options.checkpoint)
+    loaded = load_run(options.checkpoint, choose_device(options.device))
     if loaded.warp is not None:
         raise InputError(
             f"{options.checkpoint}: a forward-facing scene, whose field is not in world coordinates; "

@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 import tyro
 
 from gridreg.cli.arguments import OptionalFile, OptionalFloat, OptionalFolder, OptionalInt, OptionalText
+from gridreg.machine import DeviceName, choose_device
 
 __all__ = ["RenderOptions", "run"]
 
@@ -40,6 +41,8 @@ class RenderOptions:
     """Distance of turntable and spiral, world units; default: the median of the training cameras'."""
     scene: OptionalFolder = None
     """Where the scene lies now, for its training cameras; default: where the run found it."""
+    device: DeviceName = "cpu"
+    """Where to compute; auto: a GPU where there is one."""
 
 
 def run(options: RenderOptions) -> int:
@@ -58,7 +61,8 @@ def run(options: RenderOptions) -> int:
         raise InputError("checkpoints: found none, expected at least one run")
     if options.width is not None and options.width < 1:
         raise InputError(f"--width: found {options.width}, expected at least 1 pixel")
-    runs = [load_run(checkpoint) for checkpoint in options.checkpoints]
+    device = choose_device(options.device)
+    runs = [load_run(checkpoint, device) for checkpoint in options.checkpoints]
     first = options.checkpoints[0]
     scene = views_scene(runs[0], first, options.scene)
     if scene is None:

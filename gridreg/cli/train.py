@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from gridreg.export import check_drawing, draw_run, live_view
+from gridreg.machine import choose_device
 from gridreg.scenes import Scene
 from gridreg.training import (
     RunConfig,
@@ -39,10 +40,10 @@ def run(
         InputError: for anything that a user can mend.
     """
     with live_view(options.view, options.host, options.port) as look:
-        config = configure(options)
+        config, device = configure(options), choose_device(options.device)
         check_drawing(video=options.video)
         out = output_folder(options, config)
-        scene = open_scene(config, cache=Path("outputs"))
+        scene = open_scene(config, cache=Path("outputs")).to(device)
         print(
             f"{scene.name}, {scene.protocol}: {len(scene.train)} training and {len(scene.test)} test views of "
             f"{scene.train.width}x{scene.train.height}; results go to {out}",

@@ -6,6 +6,7 @@ import sys
 from dataclasses import dataclass
 
 from gridreg.cli.arguments import Checkpoint, OptionalFolder
+from gridreg.machine import DeviceName, choose_device
 
 __all__ = ["ViewOptions", "run"]
 
@@ -24,6 +25,8 @@ class ViewOptions:
     """Port to listen on; 0: any free one."""
     size: int = 512
     """Longer edge of the image at rest, pixels."""
+    device: DeviceName = "cpu"
+    """Where to compute; auto: a GPU where there is one."""
 
 
 def run(options: ViewOptions) -> int:
@@ -38,7 +41,7 @@ def run(options: ViewOptions) -> int:
     from gridreg.training import load_run
 
     check_address(options.host, options.port)
-    loaded = load_run(options.checkpoint)
+    loaded = load_run(options.checkpoint, choose_device(options.device))
     scene = views_scene(loaded, options.checkpoint, options.scene)
     if scene is None:
         print(f"{loaded.config.scene}: not there any more, so no training cameras", file=sys.stderr)

@@ -73,7 +73,8 @@ class Model:
             stop: asked between chunks; True gives the image up.
 
         Returns:
-            colour ``(H, W, 3)`` in [0, 1], opacity and depth ``(H, W)``, or None if it was given up.
+            colour ``(H, W, 3)`` in [0, 1], opacity and depth ``(H, W)``, on the CPU wherever the field is; None if it
+            was given up.
         """
         device = self.field.bounds.device
         lens = camera.lens
@@ -96,4 +97,4 @@ class Model:
     def _render(self, rays: Rays) -> Rendered:
         rendered = render_rays(self.field, rays, self.occupancy, self.march, background=self.background)
         # The samples would be kept for the whole image.
-        return Rendered(rendered.colour, rendered.opacity, rendered.depth)
+        return Rendered(rendered.colour.cpu(), rendered.opacity.cpu(), rendered.depth.cpu())

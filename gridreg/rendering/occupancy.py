@@ -52,6 +52,11 @@ class OccupancyGrid:
             raise ValueError("occupancy is no grid of cells in a box")
         return grid
 
+    def to(self, device: torch.device | str) -> OccupancyGrid:
+        """The same grid on a device."""
+        hull = None if self.hull is None else self.hull.to(device)
+        return OccupancyGrid(self.bounds.to(device), self.cells.to(device), hull)
+
     @property
     def resolution(self) -> tuple[int, int, int]:
         """Cells along x, y, z."""

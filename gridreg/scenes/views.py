@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -208,6 +208,15 @@ class Scene:
     world: World = IN_PLACE
     notes: tuple[str, ...] = ()
 
+    def to(self, device: torch.device | str) -> Scene:
+        """Return the same scene with what training reads on ``device``; views to score stay, as renders do."""
+        return replace(
+            self,
+            train=self.train.to(device),
+            bounds=self.bounds.to(device),
+            background=self.background.to(device),
+        )
+
     def __post_init__(self) -> None:
-        positions = torch.cat([views.poses[:, :3, 3] for views in (self.train, self.test)])
-        check_extent(self.near, self.far, self.bounds.cpu(), positions.cpu())
+        positions = torch.cat([views.poses[:, :3, 3].cpu() for views in (self.train, self.test)])
+        check_extent(self.near, self.far, self.bounds.cpu(), positions)

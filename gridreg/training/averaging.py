@@ -59,6 +59,6 @@ class WeightAverage:
         """All that a later process needs to go on."""
         return {"count": self.count, "means": self.means}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from `state_dict`."""
-        self.count, self.means = state["count"], list(state["means"])
+    def load_state_dict(self, state: dict[str, Any], device: torch.device | str = "cpu") -> None:
+        """Go on from `state_dict`, on the device of the parameters."""
+        self.count, self.means = state["count"], [mean.to(device) for mean in state["means"]]

@@ -187,6 +187,7 @@ class Execution:
             command=command,
             train_views=scene.train.names,
             uses_alpha=self.config.train.carve,
+            device=str(self.trainer.bank.pixels.device),
         )
         save_metrics(self.out / "metrics.json", metrics)
         return metrics

@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import torch
+
 import gridreg
 from gridreg.errors import InputError
 from gridreg.fields import import_modules, make_field
@@ -78,11 +80,12 @@ def members_in(path: Path) -> tuple[list[dict[str, Any]], bool, str]:
     return [{"config": saved.config, "state": saved.state}], False, saved.fingerprint
 
 
-def load_run(folder: str | Path) -> LoadedRun:
+def load_run(folder: str | Path, device: torch.device | str = "cpu") -> LoadedRun:
     """Read a checkpoint for rendering, without its scene.
 
     Args:
         folder: a checkpoint, or an output folder that holds one, of a run or of an ensemble.
+        device: where the field is to be.
 
     Raises:
         InputError: if there is none, or it is damaged.
@@ -90,7 +93,7 @@ def load_run(folder: str | Path) -> LoadedRun:
     path = checkpoint_of(folder)
     members, joined, fingerprint = members_in(path)
     with sound(path):
-        runs = [_run(member["config"], member["state"], fingerprint, path) for member in members]
+        runs = [_run(member["config"], member["state"], fingerprint, path, device) for member in members]
         return ensemble_of(runs) if joined else runs[0]
 
 
@@ -117,7 +120,9 @@ def ensemble_of(runs: Sequence[LoadedRun]) -> LoadedRun:
     )
 
 
-def _run(plain: Any, state: dict[str, Any], fingerprint: str, path: Path) -> LoadedRun:
+def _run(
+    plain: Any, state: dict[str, Any], fingerprint: str, path: Path, device: torch.device | str
+) -> LoadedRun:
     config = from_data(RunConfig, plain, source=str(path))
     folder = path.parent if path.name == "checkpoint" else path
     import_modules(config.modules, str(path), never=folder)
@@ -128,6 +133,7 @@ def _run(plain: Any, state: dict[str, Any], fingerprint: str, path: Path) -> Loa
     check_grid(config, math.prod(resolution))
     field = make_field(config.backbone, bounds, resolution, **config.field)
     load_field(field, trainer)
+    field.to(device)
     # Masks that are not yet open are part of what was trained.
     handle = gridreg.apply(field, *regularizers_of(config), total_steps=config.train.steps, seed=config.seed)
     handle.load_state_dict(trainer["handle"])
@@ -135,9 +141,9 @@ def _run(plain: Any, state: dict[str, Any], fingerprint: str, path: Path) -> Loa
     field.eval()
     return LoadedRun(
         field=field,
-        occupancy=OccupancyGrid.restored(trainer["occupancy"]),
+        occupancy=OccupancyGrid.restored(trainer["occupancy"]).to(device),
         march=march_of(field, config.train, near, far),
-        background=background_colour(state["background"]),
+        background=background_colour(state["background"]).to(device),
         handle=handle,
         warp=_saved_warp(state.get("warp")),
         config=config,

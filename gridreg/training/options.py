@@ -12,6 +12,7 @@ import tyro
 
 from gridreg.errors import InputError
 from gridreg.fields import import_modules
+from gridreg.machine import DeviceName
 from gridreg.training.config import assignments, from_yaml, override
 from gridreg.training.files import one_writer
 from gridreg.training.presets import load_preset, preset_names
@@ -62,6 +63,8 @@ class TrainOptions:
     """Of every random number; default: 0."""
     threads: _Number = None
     """Processor threads; default: all cores. Results are the same for the same number."""
+    device: DeviceName = "cpu"
+    """Where to compute; auto: a GPU where there is one."""
     set: Annotated[tuple[str, ...], tyro.conf.arg(metavar="KEY=VALUE", help_behavior_hint="")] = ()
     """Any other value of the configuration, such as train.rays=2048; `gridreg show config` lists the keys."""
     mesh: bool = True

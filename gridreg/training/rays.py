@@ -108,17 +108,15 @@ class RayBank:
         if self.reshuffle:
             index = self._next(count, generator)
         else:
-            chosen = torch.randint(
-                self.active.shape[0], (count,), generator=generator, device=self.active.device
-            )
-            index = self.active[chosen]
+            chosen = torch.randint(self.active.shape[0], (count,), generator=generator)
+            index = self.active[chosen.to(self.active.device)]
         return self.rays(index), self.pixels[index]
 
     def _next(self, count: int, generator: torch.Generator) -> Tensor:
         """The next pixels in a random order, and then of other random orders."""
         while len(self.waiting) < count:
-            order = torch.randperm(self.active.shape[0], generator=generator, device=self.active.device)
-            self.waiting = torch.cat([self.waiting, self.active[order]])
+            order = torch.randperm(self.active.shape[0], generator=generator)
+            self.waiting = torch.cat([self.waiting, self.active[order.to(self.active.device)]])
         chosen, self.waiting = self.waiting[:count], self.waiting[count:]
         return chosen
 

@@ -38,7 +38,7 @@ class Trainer:
     Args:
         field: a `gridreg.rendering.Field` module that also offers ``parameter_groups()``. ``resample(resolution)`` and
             ``shrink(bounds)`` are called if it has them.
-        scene: training views and box.
+        scene: training views and box; where its tensors are, the field is moved to.
         composition: regularizers, attached here with `gridreg.apply`.
         settings: the schedule.
         seed: of rays, jitter, backgrounds and regularizers.
@@ -53,7 +53,7 @@ class Trainer:
         *,
         seed: int = 0,
     ) -> None:
-        self.field, self.scene, self.settings = field, scene, settings
+        self.field, self.scene, self.settings = field.to(scene.bounds.device), scene, settings
         self.generator = torch.Generator().manual_seed(seed)
         self.handle = gridreg.apply(field, *composition, total_steps=settings.steps, seed=seed)
         self.warp = warp_of(scene)
@@ -133,7 +133,8 @@ class Trainer:
                 torch.cat([rays.origins, more.origins]), torch.cat([rays.directions, more.directions])
             )
             patch = (settings.patches, settings.patch_size, settings.patch_size)
-        return Batch(rays, rgba, torch.rand(len(rays), generator=self.generator), patch)
+        jitter = torch.rand(len(rays), generator=self.generator).to(rays.origins.device)
+        return Batch(rays, rgba, jitter, patch)
 
     def _background(self, batch: Batch) -> tuple[Tensor, Tensor]:
         """The colour behind each ray ``(R, 3)``, and the opacity of its target ``(R,)``, NaN where nothing tells it."""
@@ -260,10 +261,11 @@ class Trainer:
         self.handle.load_state_dict(state["handle"])
         self.generator.set_state(state["generator"])
         if "average" in state:
-            self.average.load_state_dict(state["average"])
-        self.space.occupancy = OccupancyGrid.restored(state["occupancy"])
-        self.bank.active = state["active"]
-        self.bank.waiting = state.get("waiting", self.bank.active[:0])
+            self.average.load_state_dict(state["average"], self.bank.pixels.device)
+        device = self.bank.pixels.device
+        self.space.occupancy = OccupancyGrid.restored(state["occupancy"]).to(device)
+        self.bank.active = state["active"].to(device)
+        self.bank.waiting = state.get("waiting", state["active"][:0]).to(device)
 
 
 def load_field(field: nn.Module, state: dict[str, Any], handle: gridreg.Handle | None = None) -> None:
