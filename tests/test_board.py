@@ -16,7 +16,7 @@ from gridreg.scenes import builtin_photographs, photograph_mesh
 from gridreg.scenes.board import BOARDS, Board, board_image, draw_board, get_board, marker_bits
 from gridreg.scenes.transforms import read_transforms
 
-SIZE = 320
+SIZE = 400
 
 
 @pytest.mark.parametrize("board", BOARDS.values(), ids=list(BOARDS))
@@ -86,14 +86,14 @@ def test_papers_share_no_marker() -> None:
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return builtin_photographs(tmp_path_factory.getbasetemp() / "scenes", count=4, size=SIZE)
+    return builtin_photographs(tmp_path_factory.getbasetemp() / "scenes", count=6, size=SIZE)
 
 
 class TestPhotographs:
     def test_are_what_a_telephone_stores(self, made: Path) -> None:
         paths = sorted((made / "photographs").iterdir())
-        assert [path.name for path in paths] == [f"IMG_000{k}.jpg" for k in range(1, 5)]
-        for path, orientation in zip(paths, (1, 1, 1, 6), strict=True):
+        assert [path.name for path in paths] == [f"IMG_000{k}.jpg" for k in range(1, 7)]
+        for path, orientation in zip(paths, (1, 1, 1, 6, 1, 1), strict=True):
             image = Image.open(path)
             assert image.size == (SIZE, SIZE * 3 // 4)
             assert image.getexif()[ExifTags.Base.Orientation] == orientation
@@ -128,7 +128,7 @@ class TestPhotographs:
         np.testing.assert_allclose(vertices[:, 2].min(), 0, atol=1e-12)
         np.testing.assert_allclose(vertices[:, 2].max(), 0.06 * (1.22 + 1.24), atol=1e-3)
         frames = read_transforms(made / "truth")
-        assert (len(frames.train), len(frames.test)) == (4, 8)
+        assert (len(frames.train), len(frames.test)) == (6, 8)
         for frame in frames.train:
             mask = np.asarray(Image.open(made / "truth" / str(frame.mask_path))) / 255
             fx, fy, cx, cy = frame.camera.intrinsics(0, 0)
@@ -145,7 +145,7 @@ class TestPhotographs:
 
     def test_once_and_the_same(self, made: Path, tmp_path: Path) -> None:
         before = (made / "photographs/IMG_0002.jpg").stat().st_mtime_ns
-        assert builtin_photographs(made.parent, count=4, size=SIZE) == made
+        assert builtin_photographs(made.parent, count=6, size=SIZE) == made
         assert (made / "photographs/IMG_0002.jpg").stat().st_mtime_ns == before
         first, second = (builtin_photographs(tmp_path / name, count=1, size=64) for name in "ab")
         for path in (first / "photographs").iterdir():

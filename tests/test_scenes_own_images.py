@@ -56,13 +56,19 @@ class TestImages:
         script = tmp_path / "stand_in.py"
         script.write_text(
             "import sys, pathlib\n"
+            "from PIL import Image\n"
             "images, out = map(pathlib.Path, sys.argv[1:])\n"
             f"known = dict({lines!r})\n"
             f"asked = pathlib.Path({str(tmp_path / 'names.txt')!r})\n"
-            "names = asked.read_text().split() if asked.exists() else sorted(p.name for p in images.iterdir())\n"
+            "paths = sorted(images.rglob('*.png'))\n"
+            "names = asked.read_text().split() if asked.exists() else [str(p.relative_to(images)) for p in paths]\n"
             "(out / 'model').mkdir()\n"
-            f"(out / 'model/cameras.txt').write_text('1 SIMPLE_PINHOLE 16 16 {focal} 8 8')\n"
-            "text = '\\n'.join(f'{k} {known[n]} 1 {n}\\n' for k, n in enumerate(names))\n"
+            "sizes = {p.parent.name: Image.open(p).size for p in paths}\n"
+            f"lines = [f'{{k}} SIMPLE_PINHOLE {{w}} {{h}} {focal} {{w / 2}} {{h / 2}}' "
+            "for k, (w, h) in enumerate(sizes.values())]\n"
+            "(out / 'model/cameras.txt').write_text('\\n'.join(lines))\n"
+            "camera = lambda n: [*sizes].index((images / n).parent.name)\n"
+            "text = '\\n'.join(f'{k} {known[pathlib.Path(n).name]} {camera(n)} {n}\\n' for k, n in enumerate(names))\n"
             "(out / 'model/images.txt').write_text(text + '\\n')\n"
             "(out / 'model/points3D.txt').write_text('')\n"
             "print('noise'); print('features'); print('matches'); print('cameras'); print('registered', len(names))\n"
@@ -74,7 +80,7 @@ class TestImages:
     def test_become_a_scene(self, images: Path, stand_in: Path, tmp_path: Path, source: Path) -> None:
         stages: list[str] = []
         prepared = prepare(images, tmp_path / "out", progress=stages.append)
-        assert stages == ["features", "matches", "cameras", "box"]
+        assert stages == ["markers", "features", "matches", "cameras", "box"]
         assert len(prepared.registered) == 18
         loaded = load_scene(tmp_path / "out", "holdout8")
         original = load_scene(source, "first18", test=[]).train
@@ -92,8 +98,25 @@ class TestImages:
         assert "10 of 18 images have cameras (not r_10.png," in str(prepared)
 
     def test_too_few_registered(self, images: Path, stand_in: Path, tmp_path: Path) -> None:
+        (tmp_path / "names.txt").write_text(" ".join(f"r_{k}.png" for k in range(3)))
+        refused(images, tmp_path / "out", r"only 3 of 18 images could be registered; take more images")
+
+    def test_a_partial_solution_is_kept_and_says_so(
+        self, images: Path, stand_in: Path, tmp_path: Path
+    ) -> None:
         (tmp_path / "names.txt").write_text(" ".join(f"r_{k}.png" for k in range(8)))
-        refused(images, tmp_path / "out", r"only 8 of 18 images could be registered; take more images")
+        stages: list[str] = []
+        prepared = prepare(images, tmp_path / "out", progress=stages.append)
+        assert any(stage.startswith("only 8 of 18 images could be registered; take more") for stage in stages)
+        assert (len(prepared.registered), len(prepared.missing)) == (8, 10)
+
+    def test_how_many_are_placed_is_said(self, images: Path, stand_in: Path, tmp_path: Path) -> None:
+        stand_in.write_text(
+            stand_in.read_text().replace("print('cameras')", "print('cameras'); print('placed 7')")
+        )
+        stages: list[str] = []
+        prepare(images, tmp_path / "out", progress=stages.append)
+        assert "7 of 18 images placed" in stages
 
     def test_the_worker_fails(self, images: Path, stand_in: Path, tmp_path: Path) -> None:
         stand_in.write_text("import sys; sys.stderr.write('a\\nno memory\\n'); sys.exit(3)")
@@ -139,9 +162,21 @@ class TestImages:
             (images / f"r_{k}.png").unlink()
         refused(images, tmp_path / "out", "found 3 images, expected at least 4; take more images")
 
-    def test_of_different_sizes(self, images: Path, tmp_path: Path) -> None:
-        Image.new("RGB", (12, 16)).save(images / "r_7.png")
-        refused(images, tmp_path / "out", r"r_7\.png: image is 12x16 upright, expected 16x16 as r_0\.png")
+    def test_of_different_sizes(self, images: Path, stand_in: Path, tmp_path: Path, source: Path) -> None:
+        """Each size is a folder, so a camera, to pycolmap; the scene's images are cut to what they share."""
+        with Image.open(images / "r_7.png") as image:
+            image.crop((2, 0, 14, 16)).save(images / "r_7.png")
+        prepared = prepare(images, tmp_path / "out")
+        assert len(prepared.registered) == 18
+        views = load_scene(tmp_path / "out", "holdout8")
+        original = load_scene(source, "first18", test=[]).train
+        for side in (views.train, views.test):
+            assert (side.width, side.height) == (12, 12)
+            for name, (fx, _, cx, cy) in zip(side.names, side.intrinsics.tolist(), strict=True):
+                scale = 1.0 if name == "r_7" else 0.75
+                assert fx == pytest.approx(scale * float(original.intrinsics[0, 0]))
+                assert cx == pytest.approx(6)
+                assert cy == pytest.approx(6, abs=2 * (name == "r_7") + 1e-6)
 
     def test_damaged(self, images: Path, tmp_path: Path) -> None:
         path = images / "r_7.png"

@@ -20,14 +20,15 @@ Box = Annotated[
 
 @dataclass
 class PrepareOptions:
-    """Turn a folder of images (extra `colmap`), or a scene of COLMAP, nerfstudio or instant-ngp, into a scene folder.
+    """Turn photographs, a video, or a scene of COLMAP, nerfstudio or instant-ngp into a scene folder.
 
-    The world is turned so that z is up, centred, and scaled so that the box reaches 1.3 to each side. Look at
-    cameras.png before training; give near, far and box anew where it shows them wrong.
+    Photographs on the sheet of `gridreg board` (extra `photos`) need no overlap, and their scene is in metres, z up.
+    Others need about forty (extra `colmap`); their world is turned so that z is up, centred, and scaled so that the box
+    reaches 1.3 to each side. Look at cameras.png before training; give near, far and box anew where they are wrong.
     """
 
     images: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="IMAGES")]
-    """Folder of images (.jpg, .png, all of one size), or of a scene with cameras."""
+    """Folder of images (.jpg, .png, .heic, ...) or of a scene with cameras, or a video."""
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
     """Scene folder to make; must not exist."""
     masks: OptionalFolder = None

@@ -105,6 +105,7 @@ class SceneFiles:
             orientation.
         points: ``(P, 3)`` points known to lie on surfaces, world.
         extent: near, far and box, where the format states them.
+        metric: whether the stated extent is in metres, so that its world is to be scaled.
         ndc: whether rays are to be mapped to normalised device coordinates.
         split_here: whether the format has one list and the test frames were held out of it by this reader.
         own_split: whether the files name the test frames themselves.
@@ -119,6 +120,7 @@ class SceneFiles:
     as_stored: bool = False
     points: NDArray[np.float64] | None = None
     extent: Extent | None = None
+    metric: bool = False
     ndc: bool = False
     split_here: bool = False
     own_split: bool = False

@@ -212,8 +212,9 @@ def _extent(
         derived.far if far is None else far,
         derived.bounds if bounds is None else bounds,
     )
-    # Who states a box, in a file or as an argument, counts in the world that it stands in.
-    stays = files.ndc or files.extent is not None or bounds is not None
+    # Who states a box, in a file or as an argument, counts in the world that it stands in; metres are large or small
+    # as the object is.
+    stays = files.ndc or (not files.metric and (files.extent is not None or bounds is not None))
     return (IN_PLACE, extent) if stays else settled(extent)
 
 

@@ -16,14 +16,18 @@ from PIL import Image
 
 from gridreg.errors import InputError
 from gridreg.scenes import structure_from_motion
+from gridreg.scenes.board import Board
+from gridreg.scenes.board_cameras import look_for_board, place_on_board
 from gridreg.scenes.colmap import frames_of_model, mask_of
 from gridreg.scenes.colmap_model import read_model
 from gridreg.scenes.decoding import decode, open_image
 from gridreg.scenes.files import EXTENSIONS, list_images, read_bytes, resolve_inside
 from gridreg.scenes.frames import Frame, SceneFiles
 from gridreg.scenes.images import copy_upright, fit_mask, read_rgba
+from gridreg.scenes.markers import OPENCV, has_opencv
+from gridreg.scenes.photographs import doubtful_photographs
 
-__all__ = ["Copied", "attach_masks", "copy_frames", "copy_images", "find_cameras", "shrink_images"]
+__all__ = ["Copied", "attach_masks", "copy_frames", "find_photographs", "shrink_images"]
 
 Progress = Callable[[str], None]
 
@@ -53,7 +57,7 @@ def copy_images(source: Path, scene: Path, progress: Progress) -> list[Copied]:
     """Copy the images of a folder upright into ``scene/images``; what is left aside is said.
 
     Raises:
-        InputError: for a folder without images, a damaged one, or images of different sizes.
+        InputError: for a folder without images, or a damaged one.
     """
     names = list_images(source)
     stems = [Path(name).stem for name in names if Path(name).suffix.lower() not in _HEIC]
@@ -69,55 +73,85 @@ def copy_images(source: Path, scene: Path, progress: Progress) -> list[Copied]:
         raise InputError(f"{source}: found {len(names)} images, expected at least {_FEWEST}; {_ADVICE}")
     if twice or others:
         progress(f"left aside {', '.join([*twice, *(f'{suffix} files' for suffix in others)])}")
-    copied: list[Copied] = []
-    for name in names:
-        copied.append(Copied(*copy_upright(source / name, scene / "images" / name)))
-        size, first = copied[-1].size, copied[0].size
-        if size != first:
-            raise InputError(
-                f"{source / name}: image is {size[0]}x{size[1]} upright, expected {first[0]}x{first[1]} as "
-                f"{names[0]}: all images share one camera"
-            )
+    copied = [Copied(*copy_upright(source / name, scene / "images" / name)) for name in names]
+    for doubt in doubtful_photographs([image.path for image in copied]):
+        progress(doubt)
     return copied
 
 
+def find_photographs(
+    source: Path, scene: Path, scratch: Path, progress: Progress
+) -> tuple[list[Frame], NDArray[np.float64] | None, list[Copied], Board | None]:
+    """Copy photographs into a scene folder and find their cameras: by the sheet, if they show it, else by structure
+    from motion.
+
+    Returns:
+        Frames of those that could be placed, ``(P, 3)`` points on surfaces, all of them, and the sheet.
+
+    Raises:
+        InputError: as :func:`copy_images` and :func:`find_cameras`.
+    """
+    copied = copy_images(source, scene, progress)
+    if not has_opencv():
+        progress(f"markers are not looked for, that needs {OPENCV}")
+        return *find_cameras(scene, copied, scratch, progress), copied, None
+    progress("markers")
+    seen = look_for_board(copied)
+    if seen is None:
+        return *find_cameras(scene, copied, scratch, progress), copied, None
+    placed = place_on_board(*seen, progress)
+    for name, reason in placed.left_out.items():
+        progress(f"{name} is left out: {reason}")
+    corners = np.concatenate(list(placed.board.corners.values()))
+    return placed.frames, np.pad(corners, ((0, 0), (0, 1))), copied, placed.board
+
+
 def find_cameras(
-    scene: Path, names: list[str], scratch: Path, progress: Progress
+    scene: Path, copied: list[Copied], scratch: Path, progress: Progress
 ) -> tuple[list[Frame], NDArray[np.float64] | None]:
-    """Find the cameras of the images in ``scene/images`` by pycolmap.
+    """Find the cameras of the images in ``scene/images`` by pycolmap, one lens for each size.
 
     Returns:
         Frames of the registered images, and ``(P, 3)`` points on surfaces, in the world of the model.
 
     Raises:
-        InputError: when pycolmap is missing or fails, or fewer than half of the images (or 4) got a camera.
+        InputError: when pycolmap is missing or fails, or fewer than 4 images got a camera.
     """
     if importlib.util.find_spec("pycolmap") is None:
         raise InputError(
             "pycolmap is not installed: pip install 'gridreg[colmap]', or give a folder with a COLMAP model"
         )
     flat = scratch / "flat"
-    flat.mkdir()
-    for name in names:
-        _write_opaque(scene / "images" / name, flat / name)
+    sizes = sorted({image.size for image in copied})
+    for image in copied:
+        folder = flat if len(sizes) == 1 else flat / str(sizes.index(image.size))
+        folder.mkdir(parents=True, exist_ok=True)
+        _write_opaque(image.path, folder / image.path.name)
     log = scratch / "log.txt"
     registered = 0
     with log.open("wb") as errors:
         command = [sys.executable, structure_from_motion.__file__, str(flat), str(scratch)]
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True) as worker:
             for line in worker.stdout or ():
-                stage, *count = line.split()
+                stage, *count = line.split() or [""]
                 if stage == "registered":
                     registered = int(count[0])
+                elif stage == "placed":
+                    progress(f"{count[0]} of {len(copied)} images placed")
                 elif stage in structure_from_motion.STAGES:
                     progress(stage)
     if worker.returncode != 0:
         last = (log.read_text(errors="replace").strip().splitlines() or ["no message"])[-1]
         raise InputError(f"pycolmap failed with status {worker.returncode}: {last}")
-    if registered < max(_FEWEST, len(names) / 2):
-        raise InputError(f"only {registered} of {len(names)} images could be registered; {_ADVICE}")
+    if registered < _FEWEST:
+        raise InputError(f"only {registered} of {len(copied)} images could be registered; {_ADVICE}")
+    if registered < len(copied) / 2:
+        progress(f"only {registered} of {len(copied)} images could be registered; {_ADVICE}")
     model = read_model(scratch / "model")
-    frames = frames_of_model(model, scene, "images", "pycolmap")
+    frames = [
+        replace(frame, file_path=f"images/{Path(frame.file_path).name}")
+        for frame in frames_of_model(model, scene, "images", "pycolmap")
+    ]
     return frames, model.points if len(model.points) else None
 
 
@@ -137,8 +171,7 @@ def copy_frames(files: SceneFiles, scene: Path) -> tuple[list[Frame], list[Copie
 
     Raises:
         InputError: for an image or mask that is missing or damaged, outside of its scene, or of another size
-            than its
-            camera or the other images.
+            than its camera.
     """
     frames = sorted([*files.train, *files.test], key=lambda frame: frame.file_path)
     paths = [resolve_inside(files.folder, frame.file_path, frame.where) for frame in frames]
@@ -153,12 +186,9 @@ def copy_frames(files: SceneFiles, scene: Path) -> tuple[list[Frame], list[Copie
             Copied(*copy_upright(path, target, stated=frame.camera.size, as_stored=files.as_stored))
         )
         size, first = copied[-1].size, copied[0].size
-        stated = frame.camera.width or first[0], frame.camera.height or first[1]
-        for wanted in (stated, first):
-            if abs(size[0] - wanted[0]) >= 1 or abs(size[1] - wanted[1]) >= 1:
-                raise InputError(
-                    f"{path}: image is {size[0]}x{size[1]}, expected {wanted[0]:g}x{wanted[1]:g}"
-                )
+        wanted = frame.camera.width or first[0], frame.camera.height or first[1]
+        if abs(size[0] - wanted[0]) >= 1 or abs(size[1] - wanted[1]) >= 1:
+            raise InputError(f"{path}: image is {size[0]}x{size[1]}, expected {wanted[0]:g}x{wanted[1]:g}")
         mask_path = None
         if frame.mask_path is not None:
             mask = resolve_inside(files.folder, frame.mask_path, frame.where)

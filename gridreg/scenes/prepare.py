@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Sequence, Set
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,6 +14,9 @@ from numpy.typing import NDArray
 
 from gridreg.errors import InputError
 from gridreg.machine import remove_left_behind, temporary_beside
+from gridreg.scenes.board import Board
+from gridreg.scenes.board_cameras import board_extent
+from gridreg.scenes.crops import crop_to_one_size
 from gridreg.scenes.drawing import draw_cameras
 from gridreg.scenes.extent import Extent, box_is_seen, camera_extent, centred, points_extent
 from gridreg.scenes.frames import Frame, StatedIntrinsics
@@ -23,10 +26,10 @@ from gridreg.scenes.own_images import (
     Copied,
     attach_masks,
     copy_frames,
-    copy_images,
-    find_cameras,
+    find_photographs,
     shrink_images,
 )
+from gridreg.scenes.photographs import is_video, sharpest_frames
 from gridreg.scenes.transforms import EXTENT_KEY
 from gridreg.scenes.views import IN_PLACE, World
 
@@ -78,12 +81,14 @@ def prepare(
     """Make a scene folder: upright images, ``transforms.json``, and a drawing of the cameras and the box.
 
     The world is turned so that the cameras' mean up is z, centred on the box, and scaled so that the box
-    reaches 1.3 to each side, the size at which the presets are at home. Near, far and box are written along
-    and can be overridden when the scene is loaded.
+    reaches 1.3 to each side, the size at which the presets are at home. On the sheet it is in metres, z is up,
+    and the sheet's middle is the origin. Near, far and box are written along and can be overridden when the scene is
+    loaded.
 
     Args:
-        source: a folder of images (of one size; pycolmap finds the cameras), or a scene whose
-            cameras COLMAP, nerfstudio or instant-ngp found.
+        source: a folder of images, or a video, of which the sharpest frames are taken: the sheet of `gridreg board`
+            gives the cameras where it is seen, else pycolmap; or a scene whose cameras COLMAP, nerfstudio or
+            instant-ngp found. Images of several sizes are cut to one.
         out: the scene folder to make; must not exist.
         masks: folder with a mask for every image (white is kept), which becomes its alpha: called like the
             image, with the extension ``.png`` instead of its own or after it.
@@ -98,12 +103,11 @@ def prepare(
         progress: called with the name of each stage.
 
     Raises:
-        InputError: for no, damaged or differently sized images, too few that could be registered, pycolmap
-            missing, a mask missing, near, far or box that hold nothing, or a folder ``out`` that exists or
-            cannot be written.
+        InputError: for no or damaged images, too few that could be registered, pycolmap missing, a mask missing,
+            near, far or box that hold nothing, or a folder ``out`` that exists or cannot be written.
     """
     source, out = Path(source), Path(out)
-    if not source.is_dir():
+    if not source.is_dir() and not (source.is_file() and is_video(source)):
         raise InputError(f"{source}: no such folder of images")
     if out.exists():
         raise InputError(f"{out}: exists already, expected the name of a new folder")
@@ -132,23 +136,27 @@ def prepare(
 
 
 class _Gathered(NamedTuple):
-    """Frames whose images are in place, points on surfaces, all images, and the paths that the source holds
-    out itself."""
+    """Frames whose images are in place, points on surfaces, all images, the sheet that they show, and the paths
+    that the source holds out itself."""
 
     frames: list[Frame]
     points: Array | None
     copied: list[Copied]
-    test: set[str]
+    board: Board | None = None
+    test: Set[str] = frozenset()
 
 
 def _gather(source: Path, scene: Path, scratch: Path, progress: Callable[[str], None]) -> _Gathered:
     """Fill ``scene/images`` and find the cameras."""
+    if is_video(source):
+        progress("frames")
+        taken = sharpest_frames(source, scratch / "frames")
+        progress(f"the sharpest frame of each of {taken} stretches of the video")
+        return _Gathered(*find_photographs(scratch / "frames", scene, scratch, progress))
     try:
         files = read_folder(source)
     except NotASceneError:
-        copied = copy_images(source, scene, progress)
-        frames, points = find_cameras(scene, [image.path.name for image in copied], scratch, progress)
-        return _Gathered(frames, points, copied, set())
+        return _Gathered(*find_photographs(source, scene, scratch, progress))
     if files.ndc or not files.split_here:
         raise InputError(f"{source}: needs no preparation, load it as it is")
     for note in files.notes:
@@ -160,7 +168,7 @@ def _gather(source: Path, scene: Path, scratch: Path, progress: Callable[[str], 
     frames, copied = copy_frames(files, scene)
     held = {frame.where for frame in files.test} if files.own_split else set()
     return _Gathered(
-        frames, files.points, copied, {frame.file_path for frame in frames if frame.where in held}
+        frames, files.points, copied, None, {frame.file_path for frame in frames if frame.where in held}
     )
 
 
@@ -188,14 +196,20 @@ def _write(
     bounds: Sequence[Sequence[float]] | None,
 ) -> tuple[list[Frame], Extent]:
     """Write ``transforms.json`` and ``cameras.png`` in normalised coordinates."""
-    frames, size = made.frames, made.copied[0].size
+    frames, sizes = made.frames, {f"images/{image.path.name}": image.size for image in made.copied}
+    size = sizes[frames[0].file_path]
+    if len({sizes[frame.file_path] for frame in frames}) > 1:
+        frames, size = crop_to_one_size(frames, scene, sizes)
     intrinsics = np.array([frame.camera.intrinsics(*size) for frame in frames])
     poses = np.stack([frame.pose for frame in frames])
     check_cameras(poses, intrinsics, size, [frame.where for frame in frames])
     # Points of a masked scene may lie on what the masks cut away.
     seen = None if any(frame.mask_path for frame in frames) else made.points
     try:
-        turn, world, extent = _placed(poses, intrinsics, size, seen)
+        if made.board is None:
+            turn, world, extent = _placed(poses, intrinsics, size, seen)
+        else:
+            turn, world, extent = np.eye(3), IN_PLACE, board_extent(made.board, made.frames)
     except InputError:
         # Cameras in the middle of a room, for one: their world stays as it is, if somebody says where to look
         # in it.
@@ -218,6 +232,8 @@ def _write(
     content: dict[str, Any] = {
         EXTENT_KEY: {"near": extent.near, "far": extent.far, "bounds": extent.bounds.tolist()}
     }
+    if made.board is not None:
+        content[EXTENT_KEY] |= {"unit": "metre", "board": made.board.paper}
     if made.test:
         content["test_filenames"] = sorted(made.test)
     reduced = shrink_images(frames, scene, size, longest_edge)

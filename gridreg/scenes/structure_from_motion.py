@@ -7,6 +7,7 @@ imports nothing of gridreg, and is started by its path.
 
 from __future__ import annotations
 
+import itertools
 import sys
 from pathlib import Path
 from typing import Any
@@ -18,20 +19,20 @@ _ENOUGH = 0.9
 _ROUNDS = 2
 
 STAGES = ("features", "matches", "cameras")
-"""Lines that the program prints while it works, before ``registered N``."""
+"""Lines that the program prints while it works, ``placed N`` beside them, before ``registered N``."""
 
 
 def reconstruct(images: Path, out: Path) -> int:
     """Write the largest model that pycolmap finds to ``out/model`` and return how many images are in it.
 
-    All images share one camera, since they have one size; its lens is found along with the poses.
+    The images of a folder share one camera, since they have one size; its lens is found along with the poses.
     """
     import pycolmap
 
     pycolmap.set_random_seed(0)
     database = out / "database.db"
     print(STAGES[0], flush=True)
-    pycolmap.extract_features(database, images, camera_mode=pycolmap.CameraMode.SINGLE)
+    pycolmap.extract_features(database, images, camera_mode=pycolmap.CameraMode.PER_FOLDER)
     print(STAGES[1], flush=True)
     pycolmap.match_exhaustive(database)
     print(STAGES[2], flush=True)
@@ -40,7 +41,7 @@ def reconstruct(images: Path, out: Path) -> int:
     best = _largest_model(database, images, out / "kept_lens", adjust_lens=False)
     if best is not None:
         best = _refined(best, database, images, out)
-    count = sum(1 for path in images.iterdir() if path.is_file())
+    count = sum(1 for path in images.rglob("*") if path.is_file())
     if best is None or best.num_reg_images() < _ENOUGH * count:
         free = _largest_model(database, images, out / "free_lens", adjust_lens=True)
         if free is not None and (best is None or free.num_reg_images() > best.num_reg_images()):
@@ -77,7 +78,10 @@ def _largest_model(database: Path, images: Path, out: Path, *, adjust_lens: bool
     options.mapper.random_seed = 0
     options.ba_refine_focal_length = adjust_lens
     options.ba_refine_extra_params = adjust_lens
-    models = pycolmap.incremental_mapping(database, images, out, options)
+    placed = itertools.count(3)
+    models = pycolmap.incremental_mapping(
+        database, images, out, options, next_image_callback=lambda: print("placed", next(placed), flush=True)
+    )
     return max(models.values(), key=lambda model: model.num_reg_images(), default=None)
 
 

@@ -42,7 +42,15 @@ def read_transforms(folder: Path) -> SceneFiles:
     if test:
         notes = (f"{path}: its own split, {len(frames) - len(test)} training and {len(test)} test frames",)
     return SceneFiles.held_out(
-        folder, frames, path, test=test, notes=notes, opaque=True, as_stored=True, extent=extent
+        folder,
+        frames,
+        path,
+        test=test,
+        notes=notes,
+        opaque=True,
+        as_stored=True,
+        extent=extent,
+        metric=extent is not None and content[EXTENT_KEY].get("unit") == "metre",
     )
 
 
