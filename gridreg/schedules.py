@@ -6,10 +6,11 @@ step. Schedules are frozen dataclasses, so they compare by value and go to plain
 
 from __future__ import annotations
 
+import importlib
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeAlias, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 from gridreg.errors import InputError
 
@@ -37,6 +38,38 @@ class Schedule:
     def at(self, step: int, total_steps: int) -> float:
         """Value at `step` (iterations) of a run of `total_steps`."""
         raise TypeError(f"{type(self).__name__} does not define at(step, total_steps)")
+
+    def plot(self, total_steps: int, axes: Any = None) -> Any:
+        """Draw the value over a run; return matplotlib's axes, new ones if none are given.
+
+        Raises:
+            InputError: matplotlib is not installed.
+        """
+        axes = drawing_axes(axes)
+        steps = drawn_steps(total_steps)
+        axes.plot(steps, [resolve(self, step, total_steps) for step in steps])
+        axes.set_xlabel("iteration")
+        return axes
+
+
+def drawn_steps(total_steps: int) -> list[int]:
+    """Steps of a run that a plot shows: all, or 400 of them."""
+    return sorted({round(i * total_steps / 400) for i in range(401)})
+
+
+def drawing_axes(axes: Any = None) -> Any:
+    """The axes, or matplotlib's current ones of a new figure.
+
+    Raises:
+        InputError: matplotlib is not installed.
+    """
+    try:
+        pyplot = importlib.import_module("matplotlib.pyplot")
+    except ImportError:
+        raise InputError(
+            "plot: matplotlib is not installed, expected it (`pip install matplotlib`)"
+        ) from None
+    return pyplot.subplots(layout="constrained")[1] if axes is None else axes
 
 
 Numeric: TypeAlias = float | int | Schedule | Callable[[int], float]

@@ -291,6 +291,11 @@ def test_what_acts_on_a_missing_site_may_be_skipped() -> None:
         ("L1", "density"),
         ("Orthogonality", "density"),
     ]
+    rows = [row.split()[:2] for row in str(handle).splitlines() if "skipped: no such site" in row]
+    sites = [[type(r).__name__, r.site] for r in gridreg.composition("few_tensorf") if hasattr(r, "site")]
+    assert rows == [row for row in sites if row[1] != "density"]
+    assert len(rows) == 7
+    assert handle._repr_html_().count("skipped: no such site") == 7
     (plain,) = gridreg.to_config([gridreg.FixedMask("density?")])
     assert plain["site"] == "density?"
     with pytest.raises(gridreg.InputError, match="Linear declares none of the sites density, appearance"):

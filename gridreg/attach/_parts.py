@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -28,9 +28,9 @@ class HandleParts:
         terms: weighted, detached parts of the last `loss`, by name; they sum to its value.
     """
 
-    def __init__(self, attachment: Attachment) -> None:
+    def __init__(self, attachment: Attachment, skipped: Sequence[Regularizer] = ()) -> None:
         self.terms: dict[str, Tensor] = {}
-        self._attachment = attachment
+        self._attachment, self._skipped = attachment, tuple(skipped)
 
     # --- losses ----------------------------------------------------------------------------------
 

@@ -22,7 +22,7 @@ def apply(field: nn.Module, *regularizers: Regularizer, total_steps: int, seed: 
     Args:
         field: any module.
         regularizers: in this order; two masks on one site multiply. One whose site is a name with a question mark
-            (``"encoding.position?"``) is left out where the field declares no such site.
+            (``"encoding.position?"``) is left out where the field declares no such site, and the handle shows that.
         total_steps: length of the training run, iterations; fractions in schedules refer to it.
         seed: of the handle's own random numbers.
 
@@ -46,11 +46,14 @@ def apply(field: nn.Module, *regularizers: Regularizer, total_steps: int, seed: 
         raise InputError(
             f"total_steps={total_steps!r}: expected the number of training steps, an int above 0"
         )
-    return Handle(Attachment(field, _without_missing(field, regularizers), Clock(int(total_steps), seed)))
+    kept, skipped = _without_missing(field, regularizers)
+    return Handle(Attachment(field, kept, Clock(int(total_steps), seed)), skipped)
 
 
-def _without_missing(field: nn.Module, regularizers: Sequence[Regularizer]) -> list[Regularizer]:
-    """The regularizers without those whose site may be missing and is."""
+def _without_missing(
+    field: nn.Module, regularizers: Sequence[Regularizer]
+) -> tuple[list[Regularizer], list[Regularizer]]:
+    """The regularizers without those whose site may be missing and is, and these."""
     kept, missing, found = [], [], False
     for regularizer in regularizers:
         site = getattr(regularizer, "site", None)
@@ -60,11 +63,11 @@ def _without_missing(field: nn.Module, regularizers: Sequence[Regularizer]) -> l
             kept.append(replace(regularizer, site=site[:-1]))  # type: ignore[call-arg]
             found = True
         else:
-            missing.append(site[:-1])
+            missing.append(replace(regularizer, site=site[:-1]))  # type: ignore[call-arg]
     if missing and not found:
-        names = ", ".join(dict.fromkeys(missing))
+        names = ", ".join(dict.fromkeys(str(site) for skipped in missing for site in skipped.sites()))
         raise InputError(f"{type(field).__name__} declares none of the sites {names}; see gridreg.sites_of")
-    return kept
+    return kept, missing
 
 
 def _check_regularizer(value: object) -> None:

@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import fields
+from functools import partial
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from torch import Tensor, nn
 
-from gridreg.attach._binding import Binding
+from gridreg.attach._binding import Binding, site_label
 from gridreg.attach._parts import HandleParts
 from gridreg.attach._table import html_table, table
 from gridreg.base import Regularizer
 from gridreg.errors import InputError
-
-if TYPE_CHECKING:
-    pass
+from gridreg.schedules import Schedule, drawing_axes
 
 __all__ = ["Handle"]
 
@@ -197,6 +197,38 @@ class Handle(HandleParts):
                     break
         return found
 
+    def plot(self) -> Any:
+        """Draw what follows the step, a panel each: masks whose channels are known, and schedules of numbers.
+
+        Returns:
+            matplotlib's figure.
+
+        Raises:
+            InputError: matplotlib is not installed, or nothing follows the step.
+        """
+        self._require_applied()
+        panels: list[tuple[str, Callable[[Any], Any]]] = []
+        for binding in self._bindings():
+            regularizer, place = binding.regularizer, binding.slots[0][0].place if binding.slots else None
+            draw = getattr(regularizer, "plot", None)
+            if draw is not None and place is not None and place.channels:
+                shown = place.channels if place.octaves is None else place.octaves
+                panels.append((binding.name, partial(draw, shown, self.total_steps)))
+            for entry in fields(regularizer):
+                value = getattr(regularizer, entry.name)
+                if isinstance(value, Schedule) and draw is None:
+                    panels.append((f"{binding.name}: {entry.name}", partial(value.plot, self.total_steps)))
+        if not panels:
+            raise InputError("plot: nothing here follows the step; expected a mask or a schedule")
+        figure = drawing_axes().figure
+        figure.clear()
+        figure.set_size_inches(7, 2 * len(panels))
+        for (title, panel), axes in zip(
+            panels, figure.subplots(len(panels), squeeze=False)[:, 0], strict=True
+        ):
+            panel(axes).set_title(title, fontsize="medium")
+        return figure
+
     def __repr__(self) -> str:
         attachment = self._attachment
         if attachment.removed:
@@ -207,13 +239,21 @@ class Handle(HandleParts):
         """A table: regularizer, site, channels, value now, and whether it has acted yet."""
         if self._attachment.removed:
             return repr(self)
-        return f"gridreg on {self._title}\n{table(_HEAD, map(_cells, self._bindings()))}"
+        return f"gridreg on {self._title}\n{table(_HEAD, self._rows())}"
 
     def _repr_html_(self) -> str:
         """The table as notebooks show it."""
         if self._attachment.removed:
             return html_table(repr(self), (), ())
-        return html_table(f"gridreg on {self._title}", _HEAD, map(_cells, self._bindings()))
+        return html_table(f"gridreg on {self._title}", _HEAD, self._rows())
+
+    def _rows(self) -> list[tuple[str, ...]]:
+        skipped = [
+            (type(r).__name__, site_label(site), "-", "-", "skipped: no such site")
+            for r in self._skipped
+            for site in r.sites()
+        ]
+        return [*map(_cells, self._bindings()), *skipped]
 
     @property
     def _title(self) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any
@@ -9,13 +10,16 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from gridreg.attach.selectors import outputs
 from gridreg.attach.sites import Place, SiteLike
-from gridreg.base import Context, Regularizer
+from gridreg.base import Clock, Context, Regularizer
 from gridreg.errors import InputError
 from gridreg.regularizers.mask_functions import channel_ranks
-from gridreg.schedules import check_until, fixed_end
+from gridreg.schedules import check_until, drawing_axes, drawn_steps, fixed_end
 
 __all__ = ["Mask", "broadcast", "remember", "spread"]
+
+_ALL = outputs("")
 
 
 @dataclass(frozen=True)
@@ -65,6 +69,31 @@ class Mask(Regularizer):
         if not ranks:
             return torch.ones(0)
         return self.rank_values(max(ranks) + 1, context)[_indices(ranks)]
+
+    def plot(self, channels: int | Sequence[int], total_steps: int, axes: Any = None) -> Any:
+        """Draw the mask over a run, iteration to the right and channel upwards; return matplotlib's axes.
+
+        Args:
+            channels: how many there are, or the octave of each.
+            total_steps: length of the run, iterations.
+            axes: to draw on; None: new ones.
+
+        Raises:
+            InputError: matplotlib is not installed.
+        """
+        axes = drawing_axes(axes)
+        size = channels if isinstance(channels, int) else len(channels)
+        octaves = None if isinstance(channels, int) else tuple(channels)
+        context = Context(Clock(total_steps, 0), Place("", _ALL, -1, octaves=octaves, size=size))
+        masks = []
+        for context.clock.step in (steps := drawn_steps(total_steps)):
+            masks.append(self.mask(context))
+        image = axes.pcolormesh(
+            steps, range(size), torch.stack(masks, 1).numpy(), vmin=0, vmax=1, shading="nearest"
+        )
+        axes.figure.colorbar(image, ax=axes, label="mask")
+        axes.set(xlabel="iteration", ylabel="channel")
+        return axes
 
     def prepare(self, context: Context) -> None:
         """Keep the mask over all channels of the tensor in the state."""
