@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from gridreg.cli.arguments import OptionalFloat, OptionalFolder
+from gridreg.cli.arguments import OptionalFile, OptionalFloat
 
 __all__ = ["PrepareOptions", "run"]
 
@@ -31,8 +31,11 @@ class PrepareOptions:
     """Folder of images (.jpg, .png, .heic, ...) or of a scene with cameras, or a video."""
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
     """Scene folder to make; must not exist."""
-    masks: OptionalFolder = None
-    """Folder with a mask for every image, white where it is kept, called like the image with .png."""
+    masks: Annotated[str, tyro.conf.arg(metavar="DIR|auto|none|rembg")] = "auto"
+    """Folder with a mask for every image, white where it is kept, called like the image with .png; auto: on the sheet,
+    what stands there is cut out; rembg: by a network."""
+    model: OptionalFile = None
+    """The network for --masks rembg: an .onnx file of rembg's, which you bring (package onnxruntime)."""
     near: OptionalFloat = None
     """Distance from a camera where looking begins, world units of the made scene; default: from cameras and points."""
     far: OptionalFloat = None
@@ -62,6 +65,7 @@ def run(options: PrepareOptions) -> int:
         options.images,
         options.out,
         masks=options.masks,
+        model=options.model,
         near=options.near,
         far=options.far,
         bounds=box,

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from gridreg.errors import InputError
 from gridreg.machine import remove_left_behind, temporary_beside
+from gridreg.scenes.auto_masks import MASKS, check_masks, cut_masks
 from gridreg.scenes.board import Board
 from gridreg.scenes.board_cameras import board_extent
 from gridreg.scenes.crops import crop_to_one_size
@@ -71,7 +72,8 @@ def prepare(
     source: str | Path,
     out: str | Path,
     *,
-    masks: str | Path | None = None,
+    masks: str | Path = "auto",
+    model: str | Path | None = None,
     near: float | None = None,
     far: float | None = None,
     bounds: Sequence[Sequence[float]] | None = None,
@@ -91,7 +93,9 @@ def prepare(
             instant-ngp found. Images of several sizes are cut to one.
         out: the scene folder to make; must not exist.
         masks: folder with a mask for every image (white is kept), which becomes its alpha: called like the
-            image, with the extension ``.png`` instead of its own or after it.
+            image, with the extension ``.png`` instead of its own or after it; or a way to cut them, see
+            `gridreg.scenes.auto_masks.cut_masks`: ``auto``, ``none`` or ``rembg``.
+        model: the network of ``rembg``, an ONNX file.
         near: distance from a camera where looking begins, world units of the made scene, instead of the
             derived one.
         far: distance from a camera where looking ends, likewise.
@@ -113,6 +117,7 @@ def prepare(
         raise InputError(f"{out}: exists already, expected the name of a new folder")
     if longest_edge < 8:
         raise InputError(f"longest_edge: found {longest_edge}, expected at least 8 pixels")
+    network = check_masks(masks, model)
     scratch = temporary_beside(out)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -121,8 +126,14 @@ def prepare(
         scene = scratch / "scene"
         (scene / "images").mkdir(parents=True)
         made = _gather(source, scene, scratch, progress)
-        if masks is not None:
+        if str(masks) not in MASKS:
             made = made._replace(frames=attach_masks(made.frames, Path(masks), scene, made.copied))
+        elif network is not None or (made.board is not None and str(masks) == "auto"):
+            progress("masks")
+            frames, said = cut_masks(scene, made.frames, made.board, network)
+            made = made._replace(frames=frames)
+            if said:
+                progress(said)
         progress("box")
         frames, extent = _write(made, scene, longest_edge, near, far, bounds)
         scene.rename(out)
