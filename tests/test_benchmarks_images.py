@@ -15,11 +15,12 @@ from hypothesis import strategies as st
 from PIL import ExifTags, Image
 
 from gridreg.export import Camera, Lens, Mesh, look_at
-from gridreg.scenes import prepare
+from gridreg.scenes import builtin_photographs, load_scene, photograph_mesh, prepare
 from tests.programs import ROOT, module_at
 
 bodies = module_at(ROOT / "benchmarks" / "bodies.py")
 own_photographs = module_at(ROOT / "benchmarks" / "own_photographs.py")
+own_sheet = module_at(ROOT / "benchmarks" / "own_sheet.py")
 
 
 def rotation(seed: int) -> np.ndarray:
@@ -154,3 +155,80 @@ def test_cameras_stand_around_the_body() -> None:
     front, _, behind = (camera.pose[:3, 3] for camera in places)
     assert float(front[1]) < 0 < float(behind[1])
     assert torch.allclose(front.norm(), behind.norm(), rtol=0.2)
+
+
+class TestSheet:
+    @pytest.fixture(scope="class")
+    @classmethod
+    def truth(cls, tmp_path_factory: pytest.TempPathFactory) -> Path:
+        made = builtin_photographs(tmp_path_factory.getbasetemp() / "scenes", count=6, size=400)
+        return made / "truth"
+
+    def scene(self, truth: Path, folder: Path) -> Path:
+        """A scene as `prepare` writes one, with the true cameras and masks: crops of 150 pixels at half the size."""
+        content = json.loads((truth / "transforms.json").read_text())
+        frames = []
+        for name in ("images", "masks"):
+            (folder / name).mkdir(parents=True)
+        for frame in content["frames"][:6]:
+            left, top = (max(0, round(frame[key]) - 150) for key in ("cx", "cy"))
+            for key in ("file_path", "mask_path"):
+                with Image.open(truth / frame[key]) as image:
+                    box = (left, top, left + 300, top + 300)
+                    image.resize((150, 150), Image.Resampling.BOX, box=box).save(folder / frame[key])
+            lens = {key: frame[key] / 2 for key in ("fl_x", "fl_y")}
+            centre = {"cx": (frame["cx"] - left) / 2, "cy": (frame["cy"] - top) / 2}
+            frames.append({**frame, **lens, **centre, "w": 150, "h": 150})
+        extent = {"near": 0.1, "far": 0.6, "bounds": [[-0.1, -0.1, 0], [0.1, 0.1, 0.2]], "unit": "metre"}
+        (folder / "transforms.json").write_text(json.dumps({"gridreg": extent, "frames": frames}))
+        return folder
+
+    def test_truth_has_no_error(self, truth: Path, tmp_path: Path) -> None:
+        scene = self.scene(truth, tmp_path / "scene")
+        assert max(own_sheet.camera_errors(scene, truth).values()) < 1e-5
+        assert own_sheet.mask_overlap(scene, truth)["least"] > 0.97
+
+    def test_known_errors(self, truth: Path, tmp_path: Path) -> None:
+        scene = self.scene(truth, tmp_path / "scene")
+        content = json.loads((scene / "transforms.json").read_text())
+        pose = np.array(content["frames"][2]["transform_matrix"])
+        turn = math.radians(2)
+        c, s = math.cos(turn), math.sin(turn)
+        pose[:3, :3] = pose[:3, :3] @ [[c, -s, 0], [s, c, 0], [0, 0, 1]]
+        pose[:3, 3] *= 1.01
+        content["frames"][2]["transform_matrix"] = pose.tolist()
+        (scene / "transforms.json").write_text(json.dumps(content))
+        mask = scene / content["frames"][4]["mask_path"]
+        half = np.array(Image.open(mask))
+        rows = np.flatnonzero(half.any(axis=1))
+        half[rows[len(rows) // 2] :] = 0
+        Image.fromarray(half).save(mask)
+        errors = own_sheet.camera_errors(scene, truth)
+        assert errors["rotation_degrees_max"] == pytest.approx(2)
+        assert errors["position_percent_max"] == pytest.approx(1)
+        assert errors["position_percent_median"] < 1e-9
+        assert 0.1 < own_sheet.mask_overlap(scene, truth)["least"] < 0.6
+
+    def test_true_and_estimated_scenes_share_test_views(self, truth: Path, tmp_path: Path) -> None:
+        scene = self.scene(truth, tmp_path / "scene")
+        both = [
+            own_sheet.with_test_views(scene, truth, tmp_path / str(true), true=true) for true in (False, True)
+        ]
+        first, second = (load_scene(folder, "holdout8") for folder in both)
+        assert (len(first.train), len(first.test)) == (6, 8)
+        assert torch.equal(first.test.rgba, second.test.rgba)
+        torch.testing.assert_close(first.train.poses, second.train.poses)
+        torch.testing.assert_close(first.train.intrinsics, second.train.intrinsics)
+        # The object is in the middle of the test views.
+        alpha = first.test.rgba[..., 3]
+        assert float(alpha[:, 40:110, 40:110].sum() / alpha.sum()) > 0.9
+
+    def test_mesh(self, tmp_path: Path) -> None:
+        vertices, faces = photograph_mesh(0.05)
+        Mesh(vertices, faces).to_trimesh().export(tmp_path / "same.ply")
+        Mesh(1.03 * vertices, faces).to_trimesh().export(tmp_path / "larger.ply")
+        same, larger = (own_sheet.mesh_errors(tmp_path / f"{name}.ply") for name in ("same", "larger"))
+        assert same["chamfer_percent"] < 0.2
+        assert same["size_percent"] == pytest.approx(0, abs=0.05)
+        assert larger["size_percent"] == pytest.approx(3, abs=0.05)
+        assert larger["chamfer_percent"] > 3 * same["chamfer_percent"] + 0.1

@@ -39,6 +39,7 @@ def _own(about: str, module: str, options: str) -> Command:
 
 COMMANDS: dict[str, Command] = {
     "board": _own("draw the sheet to print and to photograph an object on", "board", "BoardOptions"),
+    "reconstruct": _own("make an object of photographs, in one command", "reconstruct", "ReconstructOptions"),
     "prepare": _own("turn a folder of images into a scene", "prepare", "PrepareOptions"),
     "train": Command(
         "reconstruct a scene, score it, and write a mesh and a video",
@@ -131,7 +132,9 @@ def overview() -> str:
             "gridreg --version",
             "gridreg --tyro-print-completion bash|zsh    completion for a shell, to be sourced",
             "",
-            "From images of your own:",
+            "From photographs of your own, taken on the sheet that `gridreg board` draws:",
+            "  gridreg reconstruct PHOTOS OUT",
+            "or step by step:",
             "  gridreg prepare IMAGES SCENE",
             "  gridreg train --scene SCENE --out RUN --view",
             "  gridreg view RUN",

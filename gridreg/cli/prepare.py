@@ -28,7 +28,7 @@ class PrepareOptions:
     """
 
     images: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="IMAGES")]
-    """Folder of images (.jpg, .png, .heic, ...) or of a scene with cameras, or a video."""
+    """Folder of images (.jpg, .heic, ...) or of a scene with cameras, or a video; `builtin`: the built-in ones."""
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
     """Scene folder to make; must not exist."""
     masks: Annotated[str, tyro.conf.arg(metavar="DIR|auto|none|rembg")] = "auto"
@@ -54,6 +54,7 @@ def run(options: PrepareOptions) -> int:
     """
     import sys
 
+    from gridreg.cli.runs import photographs_of
     from gridreg.scenes import prepare
 
     box = None if options.box is None else (options.box[:3], options.box[3:])
@@ -62,7 +63,7 @@ def run(options: PrepareOptions) -> int:
         print(f"{stage} ...", file=sys.stderr, flush=True)
 
     made = prepare(
-        options.images,
+        photographs_of(options.images),
         options.out,
         masks=options.masks,
         model=options.model,

@@ -6,10 +6,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from gridreg.errors import InputError
-from gridreg.scenes import Scene
+from gridreg.scenes import Scene, builtin_photographs
 from gridreg.training import LoadedRun, open_scene
 
-__all__ = ["folder_of", "scene_of", "views_scene"]
+__all__ = ["folder_of", "photographs_of", "scene_of", "views_scene"]
 
 CACHE = Path("outputs")
 """Where the built-in scene is made, below the current folder."""
@@ -18,6 +18,13 @@ CACHE = Path("outputs")
 def folder_of(checkpoint: Path) -> Path:
     """The output folder of a run that is named by itself or by its checkpoint."""
     return checkpoint.parent if checkpoint.name == "checkpoint" else checkpoint
+
+
+def photographs_of(source: Path) -> Path:
+    """The folder of photographs that is named: for the word ``builtin``, of the built-in ones, made if need be."""
+    if source.name == str(source) == "builtin" and not source.exists():
+        return builtin_photographs(CACHE) / "photographs"
+    return source
 
 
 def scene_of(run: LoadedRun, checkpoint: Path, scene: Path | None, *, test: bool = True) -> Scene:
