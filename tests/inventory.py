@@ -18,7 +18,7 @@ def inventory() -> dict[str, list[str]]:
     from backbones.decoders import DECODERS
     from gridreg.cli import COMMANDS
     from gridreg.cli.main import options_of
-    from gridreg.export.mesh import MESH_SUFFIXES
+    from gridreg.export.mesh_files import MESH_SUFFIXES
     from gridreg.scenes.protocols import PROTOCOLS
     from gridreg.schedules import SCHEDULES
     from gridreg.training import RunConfig, preset_names

@@ -227,6 +227,12 @@ def test_mesh_and_its_comparison(desk: Path, capsys: pytest.CaptureFixture[str])
     assert 0 < json.loads((desk / "figures.json").read_text())["chamfer_relative"] < 0.1
     assert main(["compare-mesh", "run/mesh.ply", "builtin", "--samples", "2000"]) == 0
     assert "Normal consistency" in capsys.readouterr().out
+    box = ["--crop", "-1.5", "-1.5", "0", "1.5", "1.5", "1.5"]
+    assert main(["mesh", "run", "--resolution", "24", "--out", "upper.ply", *box]) == 0
+    assert "units of the scene's files, whose length is not known" in capsys.readouterr().out
+    assert read_mesh(desk / "upper.ply").vertices[:, 2].min() >= -1e-6
+    assert main(["mesh", "run", "--base", "5"]) == 2
+    assert "not one on the sheet" in capsys.readouterr().err
 
 
 def test_page_of_a_run(desk: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,7 +8,8 @@ import torch
 from numpy.typing import NDArray
 
 from gridreg.export.compare import MeshComparison, compare_meshes
-from gridreg.export.mesh import Mesh, extract_mesh, read_mesh, save_mesh
+from gridreg.export.mesh import Mesh, extract_mesh
+from gridreg.export.mesh_files import read_mesh, save_mesh
 from gridreg.scenes.builtin import BOUNDS, builtin_mesh, builtin_signed_distance
 from tests.export_fields import AnalyticField, Function
 from tests.export_meshes import assert_closed

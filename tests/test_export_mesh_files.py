@@ -13,7 +13,8 @@ import torch
 import trimesh
 
 from gridreg.errors import InputError
-from gridreg.export.mesh import Mesh, extract_mesh, read_mesh, save_mesh, write_mesh
+from gridreg.export.mesh import Mesh, extract_mesh
+from gridreg.export.mesh_files import read_mesh, save_mesh, write_mesh
 from tests.export_fields import AnalyticField, ball, box
 
 

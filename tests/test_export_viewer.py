@@ -7,6 +7,7 @@ import socket
 import sys
 import threading
 import time
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,10 +17,12 @@ import torch
 from gridreg.errors import InputError
 from gridreg.export.browser import camera_of, image_shape, start_server
 from gridreg.export.cameras import look_at
+from gridreg.export.crop_box import load_crop
 from gridreg.export.images import z_depth
 from gridreg.export.viewer import Viewer
 from gridreg.rendering import Rendered, camera_rays
 from gridreg.rendering.model import Model
+from gridreg.scenes import World
 from tests.export_fields import AnalyticField, ball, ball_model, ring_of_views
 from tests.export_viewing import FakeClient
 
@@ -253,3 +256,25 @@ class TestDrawing:
             )
         with Viewer(ball_model(step=100), port=0, quiet=True) as viewer:
             assert not viewer._panel.cameras.visible
+
+
+class TestCropBox:
+    def test_a_box_is_shown_and_saved_in_the_world_of_the_files(self, tmp_path):
+        world, path = World((10.0, 0.0, 0.0), 2.0), tmp_path / "crop.json"
+        with Viewer(ball_model(step=100), port=0, quiet=True) as viewer:
+            crop = viewer.offer_crop(path, torch.tensor([[-1.0] * 3, [1.0] * 3]), world)
+            assert crop.box.tolist() == [[8, -2, -2], [12, 2, 2]]
+            assert not crop.low.visible
+            crop.shown.value = True
+            until(lambda: crop.low.visible and crop._lines is not None)
+            # The twelve edges, in the coordinates of what is shown.
+            points = np.asarray(crop._lines.points)
+            assert points.shape == (12, 2, 3)
+            assert (np.abs(points) == 1).all()
+            assert {tuple(np.abs(a - b)) for a, b in points} == {(2, 0, 0), (0, 2, 0), (0, 0, 2)}
+            # Corners the wrong way round mean the same box.
+            crop.low.value, crop.high.value = (11.0, 1.0, 1.0), (9.0, -1.0, 0.0)
+            crop._save(SimpleNamespace(client=None))
+            assert load_crop([str(path)]).tolist() == [[9, -1, 0], [11, 1, 1]]
+            crop.shown.value = False
+            until(lambda: crop._lines is None)

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
+
+import tyro
 
 from gridreg.cli.arguments import Checkpoint, OptionalFile, OptionalFloat, OptionalInt
 from gridreg.machine import DeviceName, choose_device
@@ -26,6 +29,14 @@ class MeshOptions:
     """Parts with less surface than this share of the largest part's are dropped; 0 keeps all."""
     faces: OptionalInt = None
     """At most so many faces, such as 100000; default: as many as the resolution gives."""
+    texture: OptionalInt = None
+    """Edge of a texture in pixels, such as 1024, for .obj and .glb (extra `texture`); slow over 100000 faces."""
+    crop: Annotated[
+        tuple[str, ...], tyro.conf.arg(metavar="FILE|X0 Y0 Z0 X1 Y1 Z1", help_behavior_hint="")
+    ] = ()
+    """Box to keep, in the coordinates of the scene's files: six numbers, or a file that the viewer has saved."""
+    base: OptionalFloat = None
+    """Millimetres over the sheet below which the object goes straight down to it: closes what no photograph saw."""
     colours: bool = True
     """Colour the vertices as the field is seen along its normals."""
     device: DeviceName = "cpu"
@@ -42,6 +53,7 @@ def run(options: MeshOptions) -> int:
     from gridreg.cli.runs import folder_of
     from gridreg.errors import InputError
     from gridreg.export import write_mesh
+    from gridreg.export.crop_box import load_crop
     from gridreg.training import load_run
 
     loaded = load_run(options.checkpoint, choose_device(options.device))
@@ -50,6 +62,7 @@ def run(options: MeshOptions) -> int:
             f"{options.checkpoint}: a forward-facing scene, whose field is not in world coordinates; "
             "expected one with cameras around it"
         )
+    crop = load_crop(options.crop) if options.crop else None
     target = options.out if options.out is not None else folder_of(options.checkpoint) / "mesh.ply"
     mesh = write_mesh(
         loaded.field,
@@ -57,6 +70,9 @@ def run(options: MeshOptions) -> int:
         loaded.occupancy,
         resolution=options.resolution,
         faces=options.faces,
+        texture=options.texture,
+        crop=crop,
+        base=None if options.base is None else options.base / 1000,
         world=loaded.world,
         threshold=options.threshold,
         min_component=options.min_component,
@@ -65,6 +81,6 @@ def run(options: MeshOptions) -> int:
     closed = "watertight" if mesh.watertight else "not watertight"
     print(
         f"{target}: {len(mesh.vertices)} vertices, {len(mesh.faces)} faces, {closed}, "
-        f"volume {mesh.volume:.4g} cubic world units, cut at density {mesh.threshold:.4g} per world unit"
+        f"volume {mesh.volume:.4g} cubic world units, cut at density {mesh.threshold:.4g} per world unit; size {mesh.size}"
     )
     return 0

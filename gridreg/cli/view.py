@@ -35,7 +35,7 @@ def run(options: ViewOptions) -> int:
     Raises:
         InputError: for a missing or damaged checkpoint, without viser, or if the port is taken.
     """
-    from gridreg.cli.runs import views_scene
+    from gridreg.cli.runs import folder_of, views_scene
     from gridreg.export import Viewer
     from gridreg.export.browser import check_address
     from gridreg.training import load_run
@@ -47,5 +47,7 @@ def run(options: ViewOptions) -> int:
         print(f"{loaded.config.scene}: not there any more, so no training cameras", file=sys.stderr)
     views = None if scene is None else scene.train
     with Viewer(loaded, views, host=options.host, port=options.port, size=options.size) as viewer:
+        if loaded.warp is None:
+            viewer.offer_crop(folder_of(options.checkpoint) / "crop.json", loaded.field.bounds, loaded.world)
         viewer.wait()
     return 0

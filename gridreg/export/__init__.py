@@ -5,7 +5,8 @@ from gridreg.export.camera_paths import CAMERA_PATHS, camera_path, spiral, sway,
 from gridreg.export.cameras import Orbit, look_at, orbit_of_box, orbit_of_views
 from gridreg.export.compare import MeshComparison, compare_meshes
 from gridreg.export.images import MODES, to_image
-from gridreg.export.mesh import Mesh, extract_mesh, read_mesh, save_mesh, write_mesh
+from gridreg.export.mesh import Mesh, extract_mesh
+from gridreg.export.mesh_files import read_mesh, save_mesh, write_mesh
 from gridreg.export.page import write_page
 from gridreg.export.runs import (
     LiveView,

@@ -18,7 +18,13 @@ _FLOAT, _UINT32 = 5126, 5125
 
 
 def glb_of(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], colours: NDArray[np.uint8] | None
+    vertices: NDArray[np.float64],
+    faces: NDArray[np.int64],
+    colours: NDArray[np.uint8] | None = None,
+    places: NDArray[np.float64] | None = None,
+    texture: bytes | None = None,
+    *,
+    size: str = "",
 ) -> bytes:
     """Return the file; trimesh's own writer has 8 bits a colour, which show steps in the dark once they are linear.
 
@@ -26,6 +32,9 @@ def glb_of(
         vertices: ``(V, 3)``, y up.
         faces: ``(F, 3)``.
         colours: ``(V, 3)`` sRGB, or None.
+        places: ``(V, 2)`` in the texture from its lower left corner, or None.
+        texture: a PNG, or None.
+        size: of the object, in words.
     """
     positions = vertices.astype("<f4")
     arrays: list[tuple[NDArray[Any], int, str]] = [
@@ -35,21 +44,37 @@ def glb_of(
     attributes = {"POSITION": 1}
     if colours is not None:
         arrays.append((_linear(colours / 255).astype("<f4"), _FLOAT, "VEC3"))
-        attributes["COLOR_0"] = 2
+        attributes["COLOR_0"] = len(arrays) - 1
+    if places is not None:
+        # Here textures begin at their upper left corner.
+        arrays.append(((places * [1, -1] + [0, 1]).astype("<f4"), _FLOAT, "VEC2"))
+        attributes["TEXCOORD_0"] = len(arrays) - 1
     blocks = [array.tobytes() for array, _, _ in arrays]
     views, accessors, offset = [], [], 0
     for number, ((array, kind, shape), block) in enumerate(zip(arrays, blocks, strict=True)):
         views.append({"buffer": 0, "byteOffset": offset, "byteLength": len(block)})
         accessors.append({"bufferView": number, "componentType": kind, "count": len(array), "type": shape})
         offset += len(block)
+    surface: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
+    images: dict[str, Any] = {}
+    if texture is not None:
+        views.append({"buffer": 0, "byteOffset": offset, "byteLength": len(texture)})
+        blocks.append(texture + b"\0" * (-len(texture) % 4))
+        offset += len(blocks[-1])
+        surface["baseColorTexture"] = {"index": 0}
+        images = {
+            "textures": [{"source": 0}],
+            "images": [{"bufferView": len(views) - 1, "mimeType": "image/png"}],
+        }
     accessors[1] |= {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}
     content = {
-        "asset": {"version": "2.0", "generator": "gridreg"},
+        "asset": {"version": "2.0", "generator": "gridreg", **({"extras": {"size": size}} if size else {})},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}],
         "meshes": [{"primitives": [{"attributes": attributes, "indices": 0, "material": 0}]}],
-        "materials": [{"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}}],
+        "materials": [{"pbrMetallicRoughness": surface}],
+        **images,
         "buffers": [{"byteLength": offset}],
         "bufferViews": views,
         "accessors": accessors,

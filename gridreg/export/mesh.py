@@ -1,11 +1,8 @@
-"""A triangle mesh from a field: extraction, colours, and files."""
+"""A triangle mesh from a field: extraction and colours."""
 
 from __future__ import annotations
 
-import io
-from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -13,25 +10,14 @@ import trimesh
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gridreg.errors import InputError, silenced
-from gridreg.export._glb import Y_UP, glb_of, srgb_of
-from gridreg.export.decimation import check_faces, decimate
+from gridreg.errors import InputError
 from gridreg.export.marching import Faces, Vertices, drop_small_components, polygonise, vertex_normals
 from gridreg.export.volume import SeenDensity, sample_density, surface_threshold
 from gridreg.machine import check_memory
 from gridreg.rendering import Field, OccupancyGrid
-from gridreg.scenes import IN_PLACE, World
-from gridreg.scenes.files import read_bytes
 from gridreg.segments import optical_depth_to_weights
-from gridreg.training.files import check_output_folder, writing
 
-__all__ = ["MESH_SUFFIXES", "Mesh", "extract_mesh", "read_mesh", "save_mesh", "write_mesh"]
-
-MESH_SUFFIXES = (".ply", ".obj", ".glb", ".stl")
-"""Formats that `save_mesh` writes, by the suffix of the file's name."""
-
-READABLE = (*MESH_SUFFIXES, ".off", ".gltf")
-"""Formats that `read_mesh` reads."""
+__all__ = ["Mesh", "extract_mesh", "seen_colours"]
 
 Colours = NDArray[np.uint8]
 
@@ -45,12 +31,27 @@ class Mesh:
         faces: ``(F, 3)`` int64 vertex numbers, counterclockwise seen from outside.
         colours: ``(V, 3)`` uint8 sRGB, or None.
         threshold: density per world unit at which it was cut out of a field; None for a mesh from a file.
+        metric: whether the world unit is known to be the metre.
+        places: ``(V, 2)`` of the vertices in ``texture``, from its lower left corner, in its widths and heights; or
+            None.
+        texture: ``(H, W, 3)`` uint8 sRGB, upper row first, or None.
     """
 
     vertices: Vertices
     faces: Faces
     colours: Colours | None = None
     threshold: float | None = None
+    metric: bool = False
+    places: Vertices | None = None
+    texture: Colours | None = None
+
+    @property
+    def size(self) -> str:
+        """Edges of its bounding box in words: millimetres where the unit is the metre, else units of the files."""
+        edges = np.ptp(self.vertices, axis=0) * (1000 if self.metric else 1)
+        return " x ".join(f"{edge:.4g}" for edge in edges) + (
+            " mm" if self.metric else " units of the scene's files, whose length is not known"
+        )
 
     @property
     def corners(self) -> Vertices:
@@ -73,6 +74,9 @@ class Mesh:
     def watertight(self) -> bool:
         """True if every edge joins exactly two faces, which run along it in opposite directions."""
         mesh = self.to_trimesh()
+        if self.places is not None:
+            # A texture's seams have every vertex twice.
+            mesh.merge_vertices()
         return bool(mesh.is_watertight and mesh.is_winding_consistent)
 
     def to_trimesh(self) -> trimesh.Trimesh:
@@ -144,15 +148,20 @@ def extract_mesh(
     seen = None
     if colours:
         depth = float(volume.spacing.mean())
-        seen = _vertex_colours(field, density, vertices, vertex_normals(vertices, faces), depth, chunk)
+        seen = seen_colours(field, density, vertices, vertex_normals(vertices, faces), depth, chunk)
     return Mesh(vertices, faces, seen, level)
 
 
 @torch.no_grad()
-def _vertex_colours(
-    field: Field, density: SeenDensity, vertices: Vertices, normals: Vertices, depth: float, chunk: int
+def seen_colours(
+    field: Field,
+    density: SeenDensity,
+    vertices: Vertices,
+    normals: Vertices,
+    depth: float,
+    chunk: int = 1 << 18,
 ) -> Colours:
-    """Colours along a short ray through each vertex, from one lattice cell outside to three inside.
+    """Colours along a short ray through each vertex, from one lattice cell ``depth`` outside to three inside.
 
     A surface has a thickness: the colour right at the level set, in front of what the training pixels were
     made of, is hardly trained. The ray is composited as in renders and divided by its opacity.
@@ -177,109 +186,3 @@ def _vertex_colours(
         total[blank] = field.colour(x[blank], inward[blank]).to(x.dtype)
         result[part] = (total.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
     return result
-
-
-def _check_target(path: Path) -> None:
-    if path.suffix.lower() not in MESH_SUFFIXES:
-        raise InputError(f"{path}: found suffix {path.suffix!r}, expected one of {', '.join(MESH_SUFFIXES)}")
-    check_output_folder(path.parent)
-
-
-def save_mesh(mesh: Mesh, path: str | Path) -> None:
-    """Write a mesh as PLY (binary), OBJ, GLB or STL, by the suffix; whole or not at all. Folders are made.
-
-    Coordinates are those of the world, but for GLB, which has y up and linear colours by its standard. STL has no
-    colours.
-
-    Raises:
-        InputError: for another suffix, or if the place is not writable or the disk is full.
-    """
-    path = Path(path)
-    _check_target(path)
-    with writing(path) as temporary:
-        if path.suffix.lower() == ".glb":
-            temporary.write_bytes(glb_of(mesh.vertices @ Y_UP.T, mesh.faces, mesh.colours))
-        else:
-            mesh.to_trimesh().export(temporary, file_type=path.suffix.lower()[1:])
-
-
-def write_mesh(
-    field: Field,
-    path: str | Path,
-    occupancy: OccupancyGrid | None = None,
-    *,
-    resolution: int = 256,
-    faces: int | None = None,
-    world: World = IN_PLACE,
-    **options: Any,
-) -> Mesh:
-    """`extract_mesh` and `save_mesh` in one, in the world of the scene's files.
-
-    Args:
-        field: the field.
-        path: file to write; its suffix chooses the format.
-        occupancy: as for `extract_mesh`.
-        resolution: as for `extract_mesh`.
-        faces: at most so many; None: as they come.
-        world: where the field's coordinates lie in the world of the scene's files.
-        options: further arguments of `extract_mesh`.
-
-    Raises:
-        InputError: of either.
-    """
-    # Before minutes of work, not after.
-    _check_target(Path(path))
-    if faces is not None:
-        check_faces(faces)
-    mesh = extract_mesh(field, occupancy, resolution=resolution, **options)
-    if faces is not None and len(mesh.faces) > faces:
-        vertices, triangles, nearest = decimate(mesh.vertices, mesh.faces, faces)
-        colours = None if mesh.colours is None else mesh.colours[nearest]
-        mesh = replace(mesh, vertices=vertices, faces=triangles, colours=colours)
-    if world != IN_PLACE:
-        mesh = replace(mesh, vertices=world.outward(mesh.vertices))
-    save_mesh(mesh, path)
-    return mesh
-
-
-@np.errstate(all="ignore")
-def read_mesh(path: str | Path) -> Mesh:
-    """Read a triangle mesh; the parts of a scene become one mesh. No other file, texture or archive is opened.
-
-    Raises:
-        InputError: for another suffix than `READABLE`, or if there is no such file, it is not a mesh, it holds no
-            faces, or a face names a corner that is not there.
-    """
-    path = Path(path)
-    if path.suffix.lower() not in READABLE:
-        raise InputError(f"{path}: found suffix {path.suffix!r}, expected a mesh: {', '.join(READABLE)}")
-    try:
-        # Bytes have no neighbours: materials, textures and buffers beside the file cannot be named.
-        content, kind = io.BytesIO(read_bytes(path, "mesh file")), path.suffix.lower()[1:]
-        with silenced("trimesh"):
-            loaded = trimesh.load_mesh(content, file_type=kind, process=False, skip_materials=True)
-        mesh = loaded.to_mesh() if isinstance(loaded, trimesh.Scene) else loaded
-        if kind == "stl":
-            # It lists every triangle with corners of its own.
-            mesh.merge_vertices()
-        vertices = np.asarray(mesh.vertices, dtype=np.float64)
-        faces = np.asarray(mesh.faces, dtype=np.int64)
-    except InputError:
-        raise
-    # The readers of trimesh raise whatever their formats make them raise.
-    except Exception as error:
-        text = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"{path}: cannot be read as a triangle mesh: {text}") from error
-    if not len(faces) or not np.isfinite(vertices).all():
-        raise InputError(f"{path}: found {len(faces)} faces, expected a triangle mesh with finite corners")
-    low, high = int(faces.min()), int(faces.max())
-    if low < 0 or high >= len(vertices):
-        wrong = low if low < 0 else high
-        raise InputError(f"{path}: found a face with corner {wrong}, expected 0 to {len(vertices) - 1}")
-    colours = None
-    visual: Any = mesh.visual
-    if visual.kind == "vertex":
-        colours = np.asarray(visual.vertex_colors, dtype=np.uint8)[:, :3]
-    if kind in ("glb", "gltf"):
-        vertices, colours = vertices @ Y_UP, None if colours is None else srgb_of(colours)
-    return Mesh(vertices, faces, colours)

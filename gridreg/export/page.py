@@ -6,6 +6,7 @@ import base64
 import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,8 @@ from gridreg.export.cameras import Orbit, orbit_of_box, orbit_of_views
 from gridreg.export.decimation import decimate
 from gridreg.export.html import data_uri, encode, open_image, page_environment, spread_views, target_beside
 from gridreg.export.line_chart import Series, line_chart
-from gridreg.export.mesh import Mesh, read_mesh
+from gridreg.export.mesh import Mesh
+from gridreg.export.mesh_files import read_mesh
 from gridreg.scenes import Scene, Views, World
 from gridreg.training.curves import History
 from gridreg.training.files import write_bytes
@@ -59,6 +61,8 @@ def write_page(folder: str | Path, scene: Scene | None = None, *, run: str | Pat
     places = [Path(folder), Path(folder if run is None else run)]
     record = _record(places)
     mesh, reason = _mesh(places)
+    if mesh is not None and scene is not None:
+        mesh = replace(mesh, metric=scene.world.metric)
     orbit = _orbit(scene, mesh)
     photographs = [] if scene is None else _photographs(scene.train, scene.background)
     score, note = _score(record)
@@ -72,7 +76,7 @@ def write_page(folder: str | Path, scene: Scene | None = None, *, run: str | Pat
             object=None if mesh is None else _object(mesh, scene, orbit, len(photographs)),
             no_object=reason,
             photographs=photographs,
-            size="" if mesh is None else _size(mesh),
+            size="" if mesh is None else mesh.size,
             score=score,
             score_note=note,
             pairs=_pairs(places[0] / "test", record),
@@ -187,11 +191,6 @@ def _photographs(views: Views, background: torch.Tensor) -> list[tuple[str, str]
 def _lead(record: Mapping[str, Any], scene: Scene | None) -> str:
     count = len(record.get("train_views") or ()) or (len(scene.train) if scene is not None else 0)
     return f"Made of {count} photographs by gridreg." if count else "Made by gridreg."
-
-
-def _size(mesh: Mesh) -> str:
-    x, y, z = (float(v) for v in np.ptp(mesh.vertices, axis=0))
-    return f"{x:.4g} x {y:.4g} x {z:.4g} units of the scene's files, whose length in metres is not known."
 
 
 def _score(record: Mapping[str, Any]) -> tuple[list[tuple[str, str]], str]:

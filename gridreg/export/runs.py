@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from gridreg.errors import InputError
 from gridreg.export.browser import check_address
 from gridreg.export.camera_paths import camera_path
-from gridreg.export.mesh import write_mesh
+from gridreg.export.mesh_files import write_mesh
 from gridreg.export.page import write_page
 from gridreg.export.video import render_video
 from gridreg.export.viewer import Viewer

@@ -8,6 +8,7 @@ import math
 import sys
 import threading
 import time
+from pathlib import Path
 from typing import Any
 
 from PIL import Image
@@ -19,11 +20,12 @@ from gridreg.export.cameras import orbit_of_box, orbit_of_views
 from gridreg.export.images import colour_bar, depth_range, to_image, z_depth
 from gridreg.export.pace import Pace
 from gridreg.export.preview import Preview
+from gridreg.export.viewer_crop import CropControls
 from gridreg.export.viewer_panel import Look, Panel
 from gridreg.rendering import Rendered
 from gridreg.rendering.cameras import Camera
 from gridreg.rendering.model import Model
-from gridreg.scenes import Views
+from gridreg.scenes import Views, World
 from gridreg.training.images import ImageArray
 
 __all__ = ["Viewer"]
@@ -84,8 +86,8 @@ class Viewer:
         self._server.on_client_disconnect(self._disconnected)
         self._thread = threading.Thread(target=self._run, name="gridreg-viewer", daemon=True)
         self._thread.start()
+        reach = "this machine only" if self._admission.local else "the network, with this token"
         if not quiet:
-            reach = "this machine only" if self._admission.local else "the network, with this token"
             print(f"viewer: {self.url} (reached from {reach})", file=sys.stderr, flush=True)
 
     @property
@@ -123,6 +125,10 @@ class Viewer:
         self._thread.join()
         with quiet_console():
             self._server.stop()
+
+    def offer_crop(self, path: Path, bounds: Tensor, world: World) -> CropControls:
+        """Add controls for a box, which are saved to a file that ``gridreg mesh --crop`` takes."""
+        return CropControls(self._server, bounds, world, path)
 
     @property
     def watched(self) -> bool:
@@ -172,7 +178,6 @@ class Viewer:
             screen.moved = time.monotonic()
             self._touch(screen)
 
-        # It may have moved before anybody listened.
         self._touch(screen)
 
     def _disconnected(self, client: Any) -> None:
@@ -240,10 +245,9 @@ class Viewer:
         else:
             width = self._pace.sharper(screen.width, shape[1])
         camera = camera_of(screen.client, shape, width)
-        # A first image is always finished: something must be seen during a long movement.
-        first = screen.drawn != wanted
         start = time.monotonic()
-        rendered = self._render(camera, look, None if first else screen, wanted)
+        # A first image is always finished: something must be seen during a long movement.
+        rendered = self._render(camera, look, None if screen.drawn != wanted else screen, wanted)
         if rendered is None:
             return
         self._pace.saw(camera.lens.height * camera.lens.width, time.monotonic() - start)

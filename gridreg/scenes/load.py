@@ -120,7 +120,7 @@ def load_scene(
         builtin=(folder / BUILTIN_MARKER).is_file(),
         validation=None if validation is None else others,
         ndc=files.ndc,
-        world=world,
+        world=world._replace(metric=files.metric),
         notes=(*files.notes, *reader.notes, *_doubts(world, train, test_views)),
     )
     check_box(scene, files.points if given is not None else None)

@@ -55,6 +55,7 @@ class World(NamedTuple):
     Attributes:
         origin: ``(3,)`` the scene's origin in the world of the files.
         unit: length of the scene's unit there.
+        metric: whether the unit of the files is known to be the metre.
 
     Example:
         >>> World((10.0, 0.0, 0.0), 100.0).outward(np.array([[1.0, 2.0, 0.0]])).tolist()
@@ -63,6 +64,11 @@ class World(NamedTuple):
 
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     unit: float = 1.0
+    metric: bool = False
+
+    def __str__(self) -> str:
+        # Fingerprints of scenes hold it, so it never changes.
+        return f"World(origin={self.origin}, unit={self.unit})"
 
     def outward(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return ``(..., 3)`` points of the scene in the world of the files."""

@@ -160,7 +160,7 @@ def _saved_world(saved: dict[str, Any] | None) -> World:
     unit = float(saved["unit"])
     if not (all(map(math.isfinite, (x, y, z))) and 0 < unit < math.inf):
         raise ValueError(f"a world of origin {(x, y, z)} and unit {unit}")
-    return World((x, y, z), unit)
+    return World((x, y, z), unit, bool(saved.get("metric")))
 
 
 def _saved_warp(saved: dict[str, Any] | None) -> NdcWarp | None:

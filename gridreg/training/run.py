@@ -122,7 +122,7 @@ def save_run(folder: Path, trainer: Trainer, config: RunConfig, record: dict[str
         "record": record,
     }
     if trainer.scene.world != IN_PLACE:
-        state["world"] = {"origin": list(trainer.scene.world.origin), "unit": trainer.scene.world.unit}
+        state["world"] = trainer.scene.world._asdict() | {"origin": list(trainer.scene.world.origin)}
     save_checkpoint(folder, state, config=to_data(config), fingerprint=trainer.scene.fingerprint)
 
 
