@@ -1,4 +1,4 @@
-"""Opaque pictures on one colour: it is the background, and random ones are left out."""
+"""Opaque pictures on one colour: it is the background, random ones are left out, and silhouettes follow from it."""
 
 import json
 from dataclasses import replace
@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 
 from gridreg.attach._notices import AttachWarning
-from gridreg.scenes import builtin_scene, load_scene
+from gridreg.scenes import Views, builtin_scene, load_scene
 from gridreg.training import RunConfig, build_trainer, execute
 from tests.tiny_training import NO_EVENTS
 
@@ -71,7 +71,9 @@ def test_a_room_is_no_backdrop(opaque):
     rgba[:, :4, :, :3] = torch.rand(rgba[:, :4, :, :3].shape, generator=torch.Generator().manual_seed(0))
     room = replace(scene, train=replace(scene.train, rgba=rgba))
     assert room.train.backdrop is None
-    assert behind(build_trainer(CONFIG, room)).std() > 0.1
+    # Without surroundings, that is: what is behind the box is learned otherwise.
+    alone = replace(CONFIG, train=replace(CONFIG.train, surroundings=False))
+    assert behind(build_trainer(alone, room)).std() > 0.1
 
 
 def test_pixels_tell_their_opacity_but_not_on_a_backdrop(transparent, opaque):
@@ -89,3 +91,48 @@ def test_pixels_tell_their_opacity_but_not_on_a_backdrop(transparent, opaque):
     report = paper.train_step()
     assert report["ExpectedBackground"] == 0
     assert report["loss"] == pytest.approx(report["mse"])
+
+
+def test_silhouettes_are_those_of_the_alpha_where_they_are_decided(transparent, opaque):
+    truth = load_scene(transparent, "builtin8", test=[]).train
+    assert torch.equal(truth.silhouettes, truth.rgba[..., 3])
+    views = load_scene(opaque, "holdout8", test=[]).train
+    content = json.loads((transparent / "transforms_train.json").read_text())
+    names = [frame["file_path"].rpartition("/")[2] for frame in content["frames"]]
+    everything = load_scene(transparent, f"first{len(names)}", test=[]).train
+    alpha = torch.stack([everything.rgba[names.index(name), ..., 3] for name in views.names])
+    found = views.silhouettes
+    assert float(alpha[found == 0].max()) < 0.2
+    assert float((alpha[found == 1] > 0.95).float().mean()) > 0.95
+    # Of what is empty, and of what is full, nearly all is known.
+    assert float((found[alpha == 0] == 0).float().mean()) > 0.98
+    assert float((found[alpha == 1] == 1).float().mean()) > 0.6
+
+
+def test_noise_of_the_paper_is_paper_and_a_white_spot_is_not():
+    generator = torch.Generator().manual_seed(0)
+    rgb = 0.9 + 0.01 * torch.rand(1, 40, 40, 3, generator=generator)
+    rgb[:, 10:30, 10:30] = 0.3
+    rgb[:, 18:22, 18:22] = 0.9
+    views = Views(
+        torch.cat([rgb, torch.ones(1, 40, 40, 1)], dim=-1), torch.eye(4)[None], torch.ones(1, 4), ("a",), (0,)
+    )
+    found = views.silhouettes[0]
+    outside = torch.ones(40, 40, dtype=torch.bool)
+    outside[10:30, 10:30] = False
+    assert bool((found[outside] == 0).all())
+    assert bool(found[18:22, 18:22].isnan().all())
+    assert bool((found[12:17, 12:28] == 1).all())
+
+
+def test_silhouettes_carve_and_keep_random_backgrounds_from_what_is_undecided(opaque):
+    config = replace(CONFIG, train=replace(CONFIG.train, carve=True))
+    trainer = build_trainer(config, load_scene(opaque, "holdout8"))
+    assert trainer.occupancy.fraction < 0.9
+    assert trainer.bank.pixels[:, 3].isnan().any()
+    rendered, target = trainer.render_batch()
+    alpha = rendered.samples.target_opacity
+    drawn = (rendered.samples.background - trainer.scene.background).abs().amax(dim=-1) > 1e-6
+    assert torch.equal(drawn, ~alpha.isnan())
+    assert torch.equal(target[alpha == 0], rendered.samples.background[alpha == 0])
+    assert set(alpha[~alpha.isnan()].tolist()) <= {0.0, 1.0}

@@ -54,6 +54,7 @@ def _score(options: EvalOptions) -> int:
     from gridreg.training import load_run
     from gridreg.training.config import to_data
     from gridreg.training.evaluate import Scored, score_views
+    from gridreg.training.exposure import AFFINE_CONVENTION, affine_psnr
     from gridreg.training.files import check_output_folder
     from gridreg.training.metrics import image_metrics
     from gridreg.training.outputs import save_contact_sheet, save_scored
@@ -74,8 +75,11 @@ def _score(options: EvalOptions) -> int:
         if folder is not None:
             save_scored(folder, view)
 
-    distances = {} if lpips is None else {lpips.name: lpips}
-    scored = score_views(loaded, scene.test, each, partial(image_metrics, more=distances))
+    more: dict[str, Any] = {} if lpips is None else {lpips.name: lpips}
+    conventions = {} if lpips is None else {lpips.name: lpips.convention}
+    if loaded.exposed:
+        more, conventions = {"psnr_affine": affine_psnr, **more}, {**AFFINE_CONVENTION, **conventions}
+    scored = score_views(loaded, scene.test, each, partial(image_metrics, more=more))
     record = metrics_record(
         {view.name: view.metrics for view in scored},
         scene=scene.name,
@@ -87,8 +91,9 @@ def _score(options: EvalOptions) -> int:
         config=to_data(loaded.config),
         command=["gridreg", *sys.argv[1:]],
         train_views=scene.train.names,
-        uses_alpha=any(run.config.train.carve for run in loaded.members or (loaded,)),
-        conventions={} if lpips is None else {lpips.name: lpips.convention},
+        uses_alpha=scene.train.backdrop is None
+        and any(run.config.train.carve for run in loaded.members or (loaded,)),
+        conventions=conventions,
         **_members(loaded),
     )
     if options.out is not None:

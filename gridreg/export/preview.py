@@ -45,7 +45,8 @@ class Preview:
                 field = _copied(model.field)
         grid = model.occupancy
         cells = OccupancyGrid(grid.bounds.clone(), grid.cells.clone())
-        self._model = replace(model, field=field, occupancy=cells, handle=None)
+        around = None if model.surroundings is None else _copied(model.surroundings)
+        self._model = replace(model, field=field, occupancy=cells, handle=None, surroundings=around)
         self._attached: Handle | None = None
         self._shown: tuple[int, frozenset[str]] | None = None
 

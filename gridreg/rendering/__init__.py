@@ -14,11 +14,14 @@ from gridreg.rendering.render import (
     composite,
     render_rays,
 )
+from gridreg.rendering.surroundings import CONTRACTED, JoinedSurroundings, Surroundings, contract
 
 __all__ = [
+    "CONTRACTED",
     "Camera",
     "Ensemble",
     "Field",
+    "JoinedSurroundings",
     "Lens",
     "MarchSettings",
     "Model",
@@ -27,10 +30,12 @@ __all__ = [
     "Rays",
     "Rendered",
     "SampleHook",
+    "Surroundings",
     "box_intersection",
     "camera_rays",
     "chosen_backend",
     "composite",
+    "contract",
     "pixel_rays",
     "render_rays",
     "use_backend",

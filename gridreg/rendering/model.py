@@ -15,6 +15,7 @@ from gridreg.rendering.cameras import Camera
 from gridreg.rendering.occupancy import OccupancyGrid
 from gridreg.rendering.rays import Rays, camera_rays
 from gridreg.rendering.render import MarchSettings, Rendered, render_rays
+from gridreg.rendering.surroundings import JoinedSurroundings, Surroundings
 
 __all__ = ["Model"]
 
@@ -36,6 +37,7 @@ class Model:
         warp: maps rays of cameras to the field's coordinates, such as normalised device coordinates
             (`gridreg.scenes.ndc_rays`) for forward-facing scenes; distances are then those of the mapped
             rays. None: they are the world's.
+        surroundings: what is outside the field's box, instead of the background; None: nothing.
     """
 
     field: Any
@@ -44,6 +46,7 @@ class Model:
     background: Tensor = field(default_factory=_white)
     handle: Handle | None = None
     warp: Callable[[Rays], Rays] | None = None
+    surroundings: Surroundings | JoinedSurroundings | None = None
 
     @classmethod
     def of_field(cls, field: Any, *, resolution: int = 256, background: Tensor | None = None) -> Model:
@@ -95,6 +98,10 @@ class Model:
         )
 
     def _render(self, rays: Rays) -> Rendered:
-        rendered = render_rays(self.field, rays, self.occupancy, self.march, background=self.background)
+        around = self.surroundings
+        background = self.background if around is None else torch.zeros_like(self.background)
+        rendered = render_rays(self.field, rays, self.occupancy, self.march, background=background)
+        if around is not None:
+            rendered = around.behind(rendered, rays)
         # The samples would be kept for the whole image.
         return Rendered(rendered.colour.cpu(), rendered.opacity.cpu(), rendered.depth.cpu())

@@ -21,6 +21,7 @@ __all__ = [
     "check_box",
     "focus_point",
     "points_extent",
+    "points_seen",
     "settled",
 ]
 
@@ -219,6 +220,17 @@ def _sees_points(
     size: tuple[int, int],
 ) -> bool:
     """Tell whether any of the points lies in the image, between near and far: finds small boxes."""
+    return bool(points_seen(points, pose, values, extent, size).any())
+
+
+def points_seen(
+    points: NDArray[np.float64],
+    pose: NDArray[np.float64],
+    values: NDArray[np.float64],
+    extent: Extent,
+    size: tuple[int, int],
+) -> NDArray[np.bool_]:
+    """Tell of each point whether it lies in the image, between near and far."""
     local = (points - pose[:3, 3]) @ pose[:3, :3]
     depth = -local[:, 2]
     safe = np.maximum(depth, 1e-9)
@@ -227,7 +239,7 @@ def _sees_points(
     distance = np.linalg.norm(local, axis=-1)
     seen = (depth > 0) & (distance >= extent.near) & (distance <= extent.far)
     seen &= (column >= 0) & (column <= size[0]) & (row >= 0) & (row <= size[1])
-    return bool(seen.any())
+    return np.asarray(seen)
 
 
 def _meets_box(

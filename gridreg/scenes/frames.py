@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from gridreg.scenes.extent import Extent
 from gridreg.scenes.files import find_inside
 from gridreg.scenes.lens import NO_DISTORTION, LensDistortion
 
-__all__ = ["Frame", "SceneFiles", "StatedIntrinsics"]
+__all__ = ["Frame", "SceneFiles", "StatedIntrinsics", "camera_keys"]
 
 
 @dataclass(frozen=True)
@@ -184,3 +184,19 @@ class SceneFiles:
         return SceneFiles(
             folder, train, rest, sources, split_here=True, own_split=bool(test), notes=notes, **options
         )
+
+
+def camera_keys(camera: StatedIntrinsics, size: tuple[int, int], reduced: tuple[int, int]) -> dict[str, Any]:
+    """Return the keys of a camera for images of ``size`` that are now ``reduced``."""
+    fx, fy, cx, cy = camera.intrinsics(*size)
+    x, y = reduced[0] / size[0], reduced[1] / size[1]
+    lens = {key: value for key, value in asdict(camera.distortion).items() if value}
+    return {
+        "w": reduced[0],
+        "h": reduced[1],
+        "fl_x": fx * x,
+        "fl_y": fy * y,
+        "cx": cx * x,
+        "cy": cy * y,
+        **lens,
+    }

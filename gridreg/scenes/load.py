@@ -15,6 +15,7 @@ from gridreg.errors import InputError
 from gridreg.scenes.blender import read_blender
 from gridreg.scenes.colmap import find_models, read_colmap
 from gridreg.scenes.extent import Extent, blender_extent, check_box, points_extent, settled
+from gridreg.scenes.focus import focus_extent, surround_focus
 from gridreg.scenes.frames import Frame, SceneFiles
 from gridreg.scenes.gate import check_spread
 from gridreg.scenes.llff import read_llff
@@ -106,7 +107,9 @@ def load_scene(
     train, test_views, others = (each.views(world) for each in opened)
     if background is None:
         background = protocol.background if train.backdrop is None else train.backdrop
-    moved = "" if world == IN_PLACE else f"{world}"
+    seen = opened[0].fingerprint
+    # Scenes whose worlds were moved differently are told apart.
+    moved = seen if world == IN_PLACE else hashlib.sha256(f"{seen}{world}".encode()).hexdigest()
     scene = Scene(
         name=folder.resolve().name,
         protocol=protocol.name,
@@ -116,7 +119,7 @@ def load_scene(
         far=extent.far,
         bounds=torch.as_tensor(extent.bounds, dtype=torch.float32),
         background=background_colour(background),
-        fingerprint=_joined(opened[0].fingerprint, moved),
+        fingerprint=moved,
         builtin=(folder / BUILTIN_MARKER).is_file(),
         validation=None if validation is None else others,
         ndc=files.ndc,
@@ -203,6 +206,8 @@ def _extent(
         derived = Extent(near, far, bounds)
     elif files.extent is not None:
         derived = files.extent
+    elif not files.ndc and train.views(IN_PLACE).shows_room and surround_focus(train.poses):
+        derived = focus_extent(train.poses, train.intrinsics, train.size, files.points)
     elif files.points is not None and not any(frame.mask_path for frame in files.train):
         derived = points_extent(train.poses, files.points)
     else:
@@ -216,11 +221,6 @@ def _extent(
     # as the object is.
     stays = files.ndc or (not files.metric and (files.extent is not None or bounds is not None))
     return (IN_PLACE, extent) if stays else settled(extent)
-
-
-def _joined(fingerprint: str, moved: str) -> str:
-    """Return a fingerprint that tells apart scenes whose worlds were moved differently."""
-    return hashlib.sha256((fingerprint + moved).encode()).hexdigest() if moved else fingerprint
 
 
 def _doubts(world: World, train: Views, test: Views) -> list[str]:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable, Sequence, Set
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from gridreg.errors import InputError
@@ -20,8 +21,10 @@ from gridreg.scenes.board_cameras import board_extent
 from gridreg.scenes.crops import crop_to_one_size
 from gridreg.scenes.drawing import draw_cameras
 from gridreg.scenes.extent import Extent, box_is_seen, camera_extent, centred, points_extent
-from gridreg.scenes.frames import Frame, StatedIntrinsics
+from gridreg.scenes.focus import focus_extent, surround_focus
+from gridreg.scenes.frames import Frame, camera_keys
 from gridreg.scenes.gate import check_cameras, check_extent, check_spread
+from gridreg.scenes.images import read_rgba
 from gridreg.scenes.load import NotASceneError, read_folder
 from gridreg.scenes.own_images import (
     Copied,
@@ -32,7 +35,7 @@ from gridreg.scenes.own_images import (
 )
 from gridreg.scenes.photographs import is_video, sharpest_frames
 from gridreg.scenes.transforms import EXTENT_KEY
-from gridreg.scenes.views import IN_PLACE, World
+from gridreg.scenes.views import IN_PLACE, Views, World
 
 __all__ = ["Prepared", "prepare"]
 
@@ -184,17 +187,20 @@ def _gather(source: Path, scene: Path, scratch: Path, progress: Callable[[str], 
 
 
 def _placed(
-    poses: Array, intrinsics: Array, size: tuple[int, int], points: Array | None
+    poses: Array, intrinsics: Array, size: tuple[int, int], points: Array | None, room: bool
 ) -> tuple[Array, World, Extent]:
     """Return the rotation that takes up to z, the turned world in which the box reaches 1.3, and the extent
     in it."""
     turn = _upwards(poses[:, :3, 1].mean(axis=0))
     poses = poses.copy()
     poses[:, :3] = turn @ poses[:, :3]
-    if points is None:
+    turned = None if points is None else points @ turn.T
+    if room and surround_focus(poses):
+        extent = focus_extent(poses, intrinsics, size, turned)
+    elif turned is None:
         extent = camera_extent(poses, intrinsics, size)
     else:
-        extent = points_extent(poses, points @ turn.T)
+        extent = points_extent(poses, turned)
     return turn, *centred(extent)
 
 
@@ -215,10 +221,11 @@ def _write(
     poses = np.stack([frame.pose for frame in frames])
     check_cameras(poses, intrinsics, size, [frame.where for frame in frames])
     # Points of a masked scene may lie on what the masks cut away.
-    seen = None if any(frame.mask_path for frame in frames) else made.points
+    masked = any(frame.mask_path for frame in frames)
+    seen, room = (None, False) if masked else (made.points, _shows_room(frames[0], scene))
     try:
         if made.board is None:
-            turn, world, extent = _placed(poses, intrinsics, size, seen)
+            turn, world, extent = _placed(poses, intrinsics, size, seen, room)
         else:
             turn, world, extent = np.eye(3), IN_PLACE, board_extent(made.board, made.frames)
     except InputError:
@@ -248,7 +255,7 @@ def _write(
     if made.test:
         content["test_filenames"] = sorted(made.test)
     reduced = shrink_images(frames, scene, size, longest_edge)
-    cameras = [_camera_keys(frame.camera, size, reduced) for frame in frames]
+    cameras = [camera_keys(frame.camera, size, reduced) for frame in frames]
     shared = cameras[0] if all(camera == cameras[0] for camera in cameras) else {}
     listed = [
         {
@@ -266,6 +273,12 @@ def _write(
     return frames, extent
 
 
+def _shows_room(frame: Frame, scene: Path) -> bool:
+    """Tell whether an image is neither transparent anywhere nor on one colour."""
+    rgba = torch.from_numpy(read_rgba(scene / frame.file_path, opaque=True))[None]
+    return Views(rgba, torch.eye(4)[None], torch.ones(1, 4), ("image",), (0,)).shows_room
+
+
 def _upwards(up: Array) -> Array:
     """Return the ``(3, 3)`` smallest rotation that takes ``up`` to z; none where the cameras' ups cancel."""
     length = float(np.linalg.norm(up))
@@ -277,19 +290,3 @@ def _upwards(up: Array) -> Array:
     # Rodrigues' formula for the axis up x z, with sine and cosine from the two products.
     cross = np.array([[0.0, 0.0, -x], [0.0, 0.0, -y], [x, y, 0.0]])
     return np.asarray(np.eye(3) + cross + cross @ cross / (1 + z))
-
-
-def _camera_keys(camera: StatedIntrinsics, size: tuple[int, int], reduced: tuple[int, int]) -> dict[str, Any]:
-    """Return the keys of a camera for images of ``size`` that are now ``reduced``."""
-    fx, fy, cx, cy = camera.intrinsics(*size)
-    x, y = reduced[0] / size[0], reduced[1] / size[1]
-    lens = {key: value for key, value in asdict(camera.distortion).items() if value}
-    return {
-        "w": reduced[0],
-        "h": reduced[1],
-        "fl_x": fx * x,
-        "fl_y": fy * y,
-        "cx": cx * x,
-        "cy": cy * y,
-        **lens,
-    }

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from gridreg.errors import InputError
 from gridreg.scenes.gate import check_cameras, check_extent
+from gridreg.scenes.silhouettes import silhouettes
 
 __all__ = ["IN_PLACE", "Scene", "Views", "World", "background_colour"]
 
@@ -147,13 +148,34 @@ class Views:
         """
         if not len(self) or bool((self.rgba[..., 3] < 1).any()):
             return None
-        edge = max(1, round(_FRAME * min(self.height, self.width)))
-        rgb = self.rgba[..., :3]
-        sides = rgb[:, :edge], rgb[:, -edge:], rgb[:, :, :edge], rgb[:, :, -edge:]
-        pixels = torch.cat([side.reshape(-1, 3) for side in sides])
+        pixels = self._frame
         colour = pixels.median(dim=0).values
         agreeing = ((pixels - colour).abs().amax(dim=-1) < _CLOSE).float().mean()
         return colour if float(agreeing) >= _AGREEING else None
+
+    @property
+    def shows_room(self) -> bool:
+        """Whether there is something behind the object: images are opaque, and not before a `backdrop`."""
+        return self.backdrop is None and not bool((self.rgba[..., 3] < 1).any())
+
+    @property
+    def _frame(self) -> Tensor:
+        """Colours ``(N, 3)`` along the edges of all images."""
+        edge = max(1, round(_FRAME * min(self.height, self.width)))
+        rgb = self.rgba[..., :3]
+        sides = rgb[:, :edge], rgb[:, -edge:], rgb[:, :, :edge], rgb[:, :, -edge:]
+        return torch.cat([side.reshape(-1, 3) for side in sides])
+
+    @functools.cached_property
+    def silhouettes(self) -> Tensor:
+        """Alpha as far as it is known, ``(V, H, W)``: that of the images; before a `backdrop`, what colours tell.
+
+        NaN where they do not, see `gridreg.scenes.silhouettes`.
+        """
+        if self.backdrop is None:
+            return self.rgba[..., 3]
+        off = (self._frame - self.backdrop).abs().amax(dim=-1)
+        return silhouettes(self.rgba[..., :3], self.backdrop, off[off < _CLOSE])
 
     def composited(self, background: str | Sequence[float] | Tensor) -> Tensor:
         """Return the images over one background colour.

@@ -131,6 +131,8 @@ def _value(value: Any, hint: Any) -> Any:
     if not isinstance(value, str):
         return to_data(value)
     members = alternatives(hint)
+    if bool in members and value in ("true", "false"):
+        return value == "true"
     if any(m in (str, Path) or get_origin(m) is Literal for m in members):
         # "null" on the command line means null wherever null is allowed.
         return None if value in ("null", "~") and type(None) in members else value

@@ -63,4 +63,9 @@ def _part(member: dict[str, Any]) -> dict[str, Any]:
     state = member["state"]
     kept = {name: state[name] for name in _OF_RUN if name in state}
     trainer = {name: state["trainer"][name] for name in _OF_TRAINER}
+    if "exposure" in state["trainer"]:
+        trainer["exposure"] = {}
+    if "surroundings" in state["trainer"]:
+        around = state["trainer"]["surroundings"]
+        trainer["surroundings"] = {"nodes": around["nodes"], "field": around["field"]}
     return {"config": member["config"], "state": {**kept, "trainer": trainer}}

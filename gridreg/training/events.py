@@ -124,8 +124,7 @@ class OccupiedSpace:
             self.occupancy = OccupancyGrid(self.occupancy.bounds, self.occupancy.cells * hull, hull)
 
     def _hull(self, grid: OccupancyGrid) -> torch.Tensor:
-        views = self._scene.train
-        return visual_hull(grid, views.rgba[..., 3], views.poses, views.intrinsics)
+        return _hull(grid, self._scene)
 
     def _require_occupied(self, step: int, why: str) -> None:
         if not bool(self.occupancy.cells.any()):
@@ -169,13 +168,19 @@ def carved_box(scene: Scene, resolution: int = 128) -> torch.Tensor:
         InputError: if the silhouettes leave nothing.
     """
     grid = OccupancyGrid.full(scene.bounds, (resolution, resolution, resolution))
-    hull = visual_hull(grid, scene.train.rgba[..., 3], scene.train.poses, scene.train.intrinsics)
+    hull = _hull(grid, scene)
     if not bool(hull.any()):
         raise InputError(
             f"scene {scene.name}: the silhouettes of the training views leave no cell of the box "
             f"{scene.bounds.tolist()}; expected an object inside it: check alpha, poses and box"
         )
     return OccupancyGrid(grid.bounds, hull).tight_bounds()
+
+
+def _hull(grid: OccupancyGrid, scene: Scene) -> torch.Tensor:
+    """Cells that no silhouette of the training views proves empty; what is undecided may hold something."""
+    views = scene.train
+    return visual_hull(grid, views.silhouettes.nan_to_num(1.0), views.poses, views.intrinsics)
 
 
 def resolution_of(voxels: float, bounds: torch.Tensor) -> tuple[int, int, int]:

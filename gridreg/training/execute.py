@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -17,7 +18,9 @@ from gridreg.training.checkpoint import has_checkpoint
 from gridreg.training.config import save_yaml, to_data
 from gridreg.training.curves import History, draw_curves, draw_masks
 from gridreg.training.evaluate import Scored, mean_psnr_of, score_views
+from gridreg.training.exposure import AFFINE_CONVENTION, affine_psnr
 from gridreg.training.files import check_output_folder, one_writer
+from gridreg.training.metrics import image_metrics
 from gridreg.training.outputs import save_contact_sheet, save_scored
 from gridreg.training.progress import Interruption, Progress, compilation_shown, interruptible
 from gridreg.training.record import metrics_record, save_metrics
@@ -85,7 +88,8 @@ class Execution:
         if self.scene.train.backdrop is not None:
             colour = ", ".join(f"{c:.2f}" for c in self.scene.background.tolist())
             progress.message(
-                f"opaque photographs on one colour ({colour}): it is the background, never a random one"
+                f"opaque photographs on one colour ({colour}): it is the background"
+                + (", and tells their silhouettes" if self.trainer.space.carves else ", never a random one")
             )
 
         def each(report: StepReport) -> bool:
@@ -153,7 +157,8 @@ class Execution:
                 raise KeyboardInterrupt
 
         done: list[Scored] = []
-        scored = score_views(trainer.model, self.scene.test, each)
+        more = {} if trainer.beside.exposure is None else {"psnr_affine": affine_psnr}
+        scored = score_views(trainer.model, self.scene.test, each, partial(image_metrics, more=more))
         trainer.field.train()
         self.seconds["test"] = work_clock() - began
         return scored
@@ -186,7 +191,8 @@ class Execution:
             config=to_data(self.config),
             command=command,
             train_views=scene.train.names,
-            uses_alpha=self.config.train.carve,
+            conventions={} if self.trainer.beside.exposure is None else AFFINE_CONVENTION,
+            uses_alpha=self.config.train.carve and scene.train.backdrop is None,
             device=str(self.trainer.bank.pixels.device),
         )
         save_metrics(self.out / "metrics.json", metrics)

@@ -13,7 +13,7 @@ import torch
 import gridreg
 from gridreg.errors import InputError
 from gridreg.fields import import_modules, make_field
-from gridreg.rendering import Ensemble, Model, OccupancyGrid
+from gridreg.rendering import Ensemble, JoinedSurroundings, Model, OccupancyGrid, Surroundings
 from gridreg.scenes import IN_PLACE, World
 from gridreg.scenes.gate import check_extent
 from gridreg.scenes.views import background_colour
@@ -23,6 +23,7 @@ from gridreg.training.events import march_of
 from gridreg.training.rays import NdcWarp
 from gridreg.training.run import check_grid, regularizers_of
 from gridreg.training.settings import RunConfig
+from gridreg.training.surroundings import make_surroundings
 from gridreg.training.trainer import load_field
 
 __all__ = ["LoadedRun", "checkpoint_of", "ensemble_of", "load_run", "members_in"]
@@ -33,13 +34,14 @@ class LoadedRun(Model):
     """A trained field, in eval mode, with all it takes to render it, and the run that it comes from.
 
     Args:
-        field, occupancy, march, background, warp: see `gridreg.rendering.Model`.
+        field, occupancy, march, background, warp, surroundings: see `gridreg.rendering.Model`.
         handle: of the regularizers; masks that are not fully open act only as long as it is kept. None for an ensemble,
             whose members have theirs.
         config: of the run; of an ensemble, the first member's.
         step: iterations done; of an ensemble, the fewest of its members'.
         fingerprint: of the scene it was trained on, see `gridreg.scenes.Scene`.
         world: where the scene lies in the world of its files.
+        exposed: whether exposures of the photographs were estimated.
         members: the runs that an ensemble is made of, else none.
     """
 
@@ -47,6 +49,7 @@ class LoadedRun(Model):
     step: int
     fingerprint: str
     world: World = IN_PLACE
+    exposed: bool = False
     members: tuple[LoadedRun, ...] = ()
 
 
@@ -107,6 +110,7 @@ def ensemble_of(runs: Sequence[LoadedRun]) -> LoadedRun:
         InputError: without runs.
     """
     field = Ensemble([run.field for run in runs], [run.occupancy for run in runs]).eval()
+    around = [run.surroundings for run in runs if isinstance(run.surroundings, Surroundings)]
     march = replace(runs[0].march, step=min(run.march.step for run in runs))
     step = min(run.step for run in runs)
     return replace(
@@ -116,6 +120,7 @@ def ensemble_of(runs: Sequence[LoadedRun]) -> LoadedRun:
         march=march,
         step=step,
         handle=None,
+        surroundings=JoinedSurroundings(around) if len(around) == len(runs) else None,
         members=tuple(runs),
     )
 
@@ -146,6 +151,8 @@ def _run(
         background=background_colour(state["background"]).to(device),
         handle=handle,
         warp=_saved_warp(state.get("warp")),
+        surroundings=_saved_surroundings(trainer.get("surroundings"), device),
+        exposed="exposure" in trainer,
         config=config,
         step=int(trainer["step"]),
         fingerprint=fingerprint,
@@ -161,6 +168,14 @@ def _saved_world(saved: dict[str, Any] | None) -> World:
     if not (all(map(math.isfinite, (x, y, z))) and 0 < unit < math.inf):
         raise ValueError(f"a world of origin {(x, y, z)} and unit {unit}")
     return World((x, y, z), unit, bool(saved.get("metric")))
+
+
+def _saved_surroundings(saved: dict[str, Any] | None, device: torch.device | str) -> Surroundings | None:
+    if saved is None:
+        return None
+    found = make_surroundings(saved["field"]["box"], 0.0, nodes=saved["nodes"])
+    found.load_state_dict(saved["field"])
+    return found.eval().to(device)
 
 
 def _saved_warp(saved: dict[str, Any] | None) -> NdcWarp | None:

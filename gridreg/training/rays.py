@@ -9,11 +9,12 @@ import torch
 from torch import Tensor
 
 from gridreg import ops
+from gridreg.attach.handle import Handle
 from gridreg.errors import InputError
 from gridreg.rendering import OccupancyGrid, Rays, box_intersection, pixel_rays
 from gridreg.scenes import Scene, Views, ndc_rays
 
-__all__ = ["Batch", "NdcWarp", "RayBank", "meets", "warp_of"]
+__all__ = ["Batch", "NdcWarp", "RayBank", "behind", "known_alpha", "meets", "warp_of"]
 
 
 @dataclass(frozen=True)
@@ -22,7 +23,7 @@ class Batch:
 
     Args:
         rays: ``R`` of them.
-        rgba: ``(S, 4)`` pixels that the first ``S`` rays are compared with.
+        rgba: ``(S, 4)`` pixels that the first ``S`` rays are compared with; alpha is NaN where it is not known.
         jitter: ``(R,)`` in [0, 1), the fraction of a step by which each ray's samples are shifted.
         patch: ``(count, height, width)`` of the patches that the last rays form; None: there are none.
     """
@@ -69,6 +70,42 @@ def warp_of(scene: Scene) -> NdcWarp | None:
     return NdcWarp((fx, fy, cx, cy), scene.train.height, scene.train.width)
 
 
+def known_alpha(scene: Scene, carve: bool) -> Tensor | None:
+    """Alpha that the silhouettes of opaque images on one colour tell, if they count; None: the images' own."""
+    if scene.train.backdrop is None:
+        return None
+    alpha = scene.train.silhouettes
+    return alpha if carve and not scene.ndc else torch.full_like(alpha, torch.nan)
+
+
+def behind(
+    batch: Batch, scene: Scene, handle: Handle, generator: torch.Generator, *, black: bool
+) -> tuple[Tensor, Tensor]:
+    """The colour behind each ray ``(R, 3)``, and the opacity of its target ``(R,)``, NaN where nothing tells it.
+
+    Args:
+        batch: of ``R`` rays.
+        scene: its background, and whether images are opaque on one colour.
+        handle: may draw backgrounds.
+        generator: source of the random numbers.
+        black: something else is put behind the rays later.
+    """
+    count, default = len(batch.rays), scene.background.to(batch.rgba).expand(len(batch.rays), 3)
+    opacity = batch.rgba.new_full((count,), torch.nan)
+    if black:
+        return torch.zeros_like(default), opacity
+    opacity[: len(batch.rgba)] = batch.rgba[:, 3]
+    if scene.train.backdrop is not None and bool(opacity.isnan().all()):
+        return default, opacity
+    background = handle.background(count, generator, scene.background.to(batch.rgba))
+    if background is None:
+        return default, opacity
+    if scene.train.backdrop is None:
+        return background.expand(count, 3), opacity
+    # Where paper may be seen, another background would be answered with walls of the paper's colour.
+    return torch.where(opacity.isnan()[:, None], default, background), opacity
+
+
 class RayBank:
     """All pixels of the training views; rays are made for those that are drawn.
 
@@ -76,14 +113,24 @@ class RayBank:
         views: ``V`` images of ``H x W``.
         warp: maps their rays to the field's coordinates; None: these are the world's.
         reshuffle: draw every active pixel once before any is drawn again, instead of with replacement.
+        alpha: ``(V, H, W)`` instead of the images' own, NaN where it is not known.
     """
 
-    def __init__(self, views: Views, warp: NdcWarp | None = None, *, reshuffle: bool = False) -> None:
+    def __init__(
+        self,
+        views: Views,
+        warp: NdcWarp | None = None,
+        *,
+        reshuffle: bool = False,
+        alpha: Tensor | None = None,
+    ) -> None:
         self.views, self.warp, self.reshuffle = views, warp, reshuffle
         self.count, self.height, self.width = views.rgba.shape[:3]
-        self.pixels = views.rgba.reshape(-1, 4)
+        rgba = views.rgba if alpha is None else torch.cat([views.rgba[..., :3], alpha[..., None]], dim=-1)
+        self.pixels = rgba.reshape(-1, 4)
         self.active = torch.arange(self.pixels.shape[0], device=self.pixels.device)
         self.waiting = self.active[:0]
+        self.drawn = self.active[:0]
 
     def rays(self, index: Tensor) -> Rays:
         """Rays through pixels given by flat index ``(R,)``."""
@@ -110,7 +157,13 @@ class RayBank:
         else:
             chosen = torch.randint(self.active.shape[0], (count,), generator=generator)
             index = self.active[chosen.to(self.active.device)]
+        self.drawn = index
         return self.rays(index), self.pixels[index]
+
+    @property
+    def drawn_views(self) -> Tensor:
+        """The view of each ray of the last draw, ``(R,)``."""
+        return self.drawn // (self.height * self.width)
 
     def _next(self, count: int, generator: torch.Generator) -> Tensor:
         """The next pixels in a random order, and then of other random orders."""
@@ -123,7 +176,7 @@ class RayBank:
     def restrict(self, useful: Callable[[Rays], Tensor], chunk: int = 1 << 15) -> None:
         """Keep the active pixels whose ray is useful, and all that are not transparent."""
         parts = torch.split(self.active, chunk)
-        kept = [part[useful(self.rays(part)) | (self.pixels[part, 3] > 0)] for part in parts]
+        kept = [part[useful(self.rays(part)) | (self.pixels[part, 3] != 0)] for part in parts]
         self.active = torch.cat(kept)
         self.waiting = self.active[:0]
 

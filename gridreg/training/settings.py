@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 from gridreg.errors import ConfigError
 
@@ -59,6 +59,9 @@ class TrainSettings:
             before the last resampling); at the end of the run it takes the place of the last one. 1: the last stays.
         checkpoint_minutes: between checkpoints.
         evaluate_at: iterations at which the validation views (or, without them, some test views) are scored on the way.
+        surroundings: learn what is outside the box in a coarse field of its own, see
+            `gridreg.training.surroundings.wants_surroundings`.
+        exposure: estimate a gain and a white balance of each training photograph, see `gridreg.training.exposure`.
     """
 
     steps: int = 15_000
@@ -88,6 +91,8 @@ class TrainSettings:
     average_from: float = 1.0
     checkpoint_minutes: float = 2.0
     evaluate_at: tuple[int, ...] = ()
+    surroundings: bool | Literal["auto"] = dataclasses.field(default="auto", metadata={"unset": True})
+    exposure: bool = dataclasses.field(default=False, metadata={"unset": True})
 
     def __post_init__(self) -> None:
         for name, least in _AT_LEAST.items():

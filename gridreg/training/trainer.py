@@ -17,8 +17,9 @@ from gridreg.errors import InputError
 from gridreg.rendering import MarchSettings, Model, OccupancyGrid, Rays, Rendered, render_rays
 from gridreg.scenes import Scene
 from gridreg.training.averaging import WeightAverage
+from gridreg.training.beside import Beside
 from gridreg.training.events import OccupiedSpace
-from gridreg.training.rays import Batch, RayBank, warp_of
+from gridreg.training.rays import Batch, RayBank, behind, known_alpha, warp_of
 from gridreg.training.settings import TrainSettings
 from gridreg.training.unseen import UnseenPatches
 
@@ -57,7 +58,9 @@ class Trainer:
         self.generator = torch.Generator().manual_seed(seed)
         self.handle = gridreg.apply(field, *composition, total_steps=settings.steps, seed=seed)
         self.warp = warp_of(scene)
-        self.bank = RayBank(scene.train, self.warp, reshuffle=settings.reshuffle)
+        self.bank = RayBank(
+            scene.train, self.warp, reshuffle=settings.reshuffle, alpha=known_alpha(scene, settings.carve)
+        )
         self.unseen: UnseenPatches | None = None
         if any("patch" in regularizer.needs() for regularizer in composition):
             self.unseen = UnseenPatches(scene.train, settings.patch_size, self.warp)
@@ -65,6 +68,7 @@ class Trainer:
         self.space = OccupiedSpace(field, scene, settings, self.bank, self.handle.suspended)
         self._restart_at = 0
         self.average = WeightAverage()
+        self.beside = Beside(scene, settings, seed)
         self.optimizer = self._make_optimizer()
         make = getattr(field, "gradient_context", None)
         self._gradient_context: Callable[[], AbstractContextManager[Any]] = (
@@ -84,7 +88,8 @@ class Trainer:
     @property
     def model(self) -> Model:
         """The field with all it takes to render it; nothing is copied, so it follows the training."""
-        return Model(self.field, self.occupancy, self.march, self.scene.background, self.handle, self.warp)
+        background, warp = self.scene.background, self.warp
+        return Model(self.field, self.occupancy, self.march, background, self.handle, warp, self.beside.model)
 
     def _make_optimizer(self) -> torch.optim.Optimizer:
         rates = {"grid": self.settings.learning_rate_grid, "network": self.settings.learning_rate_network}
@@ -136,20 +141,12 @@ class Trainer:
         jitter = torch.rand(len(rays), generator=self.generator).to(rays.origins.device)
         return Batch(rays, rgba, jitter, patch)
 
-    def _background(self, batch: Batch) -> tuple[Tensor, Tensor]:
-        """The colour behind each ray ``(R, 3)``, and the opacity of its target ``(R,)``, NaN where nothing tells it."""
-        count, default = len(batch.rays), self.scene.background.to(batch.rgba)
-        background, opacity = None, batch.rgba.new_full((count,), math.nan)
-        # Behind opaque photographs on one colour, random ones would be answered with walls of that colour.
-        if self.scene.train.backdrop is None:
-            background = self.handle.background(count, self.generator, default)
-            opacity[: len(batch.rgba)] = batch.rgba[:, 3]
-        return (default if background is None else background).expand(count, 3), opacity
-
     def render_batch(self) -> tuple[Rendered, Tensor]:
         """Draw rays, render them, and composite the targets of the first ones on the same background ``(S, 3)``."""
         batch, march = self.draw_batch(), self.march
-        background, opacity = self._background(batch)
+        background, opacity = behind(
+            batch, self.scene, self.handle, self.generator, black=self.beside.surroundings is not None
+        )
         ones = torch.ones_like(batch.jitter)
         rendered = render_rays(
             self.field,
@@ -164,7 +161,10 @@ class Trainer:
             target_opacity=opacity,
             patch=batch.patch,
         )
+        rendered = self.beside.finish(rendered, batch, self.bank, self.generator)
         rgb, alpha = batch.rgba[:, :3], batch.rgba[:, 3:]
+        if self.scene.train.backdrop is not None:
+            alpha = alpha.nan_to_num(1.0)
         return rendered, rgb * alpha + (1 - alpha) * background[: len(rgb)]
 
     def train_step(self) -> StepReport:
@@ -215,6 +215,7 @@ class Trainer:
             report.update(values)
         else:
             self.optimizer.step()
+        self.beside.step(self.step)
         return report
 
     def advance(self) -> None:
@@ -250,6 +251,7 @@ class Trainer:
             },
             "active": self.bank.active,
             "waiting": self.bank.waiting.clone(),
+            **self.beside.state_dict(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -266,6 +268,7 @@ class Trainer:
         self.space.occupancy = OccupancyGrid.restored(state["occupancy"]).to(device)
         self.bank.active = state["active"].to(device)
         self.bank.waiting = state.get("waiting", state["active"][:0]).to(device)
+        self.beside.load_state_dict(state)
 
 
 def load_field(field: nn.Module, state: dict[str, Any], handle: gridreg.Handle | None = None) -> None:
