@@ -2,13 +2,14 @@
 
     python benchmarks/foreign.py choose --data DIR --scenes builtin lego --steps 200
     python benchmarks/foreign.py compare --data DIR --scenes builtin lego --seeds 0 1 2
+    python benchmarks/foreign.py cost
 
 The fields are nerfstudio's TensoRFField, NerfactoField (hash grid, its torch implementation) and NeRFField, and
 K-Planes as `kplanes-nerfstudio` has it; needs both packages. Fields that are compared start alike and see the same
 rays, in turns, a step of the one and a step of the other, in a loop that knows of gridreg only `handle.step`,
 `handle.background` and `handle.loss`. `choose` scores pieces alone on validation views (seed 0), then those together
-that gained; `compare` scores the best of all, in the mean of the scenes, on test views. Seconds are of processor
-time, so other programs do not count; give it one thread.
+that gained; `compare` scores the best of all, in the mean of the scenes, on test views. `cost` times steps with masks
+that are all open. Seconds are of processor time, so other programs do not count; give it one thread.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from gridreg.training.versions import versions
 STUDY = "foreign"
 SIZE, RAYS, SAMPLES, STEPS = 100, 192, 32, 400
 FIELDS = ("tensorf", "kplanes", "hash", "mlp")
-BARE = "bare"
+BARE, OPEN = "bare", "open"
 
 
 class Training:
@@ -46,7 +47,10 @@ class Training:
     def __init__(self, field: str, name: str, scene: Scene, steps: int, seed: int) -> None:
         self.foreign, self.scene, self.steps = make(field, scene.bounds, seed), scene, steps
         self.generator = torch.Generator().manual_seed(seed)
-        self.regularizers = [] if name == BARE else composition(self.foreign, name)
+        self.opened = name == OPEN
+        self.regularizers = [*self.foreign.masks] if self.opened else []
+        if name not in (BARE, OPEN):
+            self.regularizers = composition(self.foreign, name)
         self.handle = None
         if self.regularizers:
             self.handle = gridreg.apply(self.foreign.field, *self.regularizers, total_steps=steps)
@@ -104,7 +108,8 @@ class Training:
         jitter = torch.rand(RAYS, 1, generator=self.generator)
         background, rgba = self.scene.background, self.rgba[chosen]
         if self.handle:
-            self.handle.step(step)
+            # Past every end, masks are open.
+            self.handle.step(step + 10**6 * self.opened)
             background = self.handle.background(RAYS, self.generator, background)
         rays = self.origins[chosen], self.directions[chosen]
         colour, samples = self.render(rays, jitter, background, rgba[:, 3])
@@ -131,6 +136,26 @@ class Training:
             error = F.mse_loss(torch.cat(image).clamp(0, 1), targets[i, ::2, ::2].reshape(-1, 3))
             found.append(-10 * float(error.log10()))
         return found
+
+
+def cost(field: str, scene: Scene, options: argparse.Namespace) -> None:
+    """Time steps of a field with open masks against bare ones, in turns, and store the quotient of each pair."""
+    pair = [Training(field, name, scene, options.steps, 0) for name in (BARE, OPEN)]
+    for step in range(options.steps):
+        for training in pair[:: 1 if step % 2 else -1]:
+            training.step(step)
+    seconds = [statistics.median(training.seconds) for training in pair]
+    record = {
+        "field": field,
+        "split": "cost",
+        "steps": options.steps,
+        "step_seconds": dict(zip((BARE, "attached"), seconds, strict=True)),
+        "percent": 100 * (seconds[1] / seconds[0] - 1),
+        "versions": versions(),
+        "command": stored.command_line("benchmarks/foreign.py"),
+    }
+    stored.save(STUDY, f"{field}-open-masks", record, options.results)
+    print(f"{field}: step {1000 * seconds[0]:.2f} ms bare, open masks {record['percent']:+.1f} %", flush=True)
 
 
 def open_scene(name: str, data: Path | None) -> Scene:
@@ -225,7 +250,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("do", choices=("choose", "compare"))
+    parser.add_argument("do", choices=("choose", "compare", "cost"))
     parser.add_argument("--data", type=Path, help="folder that holds the scenes")
     parser.add_argument("--scenes", nargs="+", default=["builtin"])
     parser.add_argument("--fields", nargs="+", choices=FIELDS, default=list(FIELDS))
@@ -235,7 +260,10 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--results", type=Path, default=stored.RESULTS)
     options = parser.parse_args(words)
     torch.set_num_threads(options.threads)
-    if options.do == "choose":
+    if options.do == "cost":
+        for field in options.fields:
+            cost(field, open_scene("builtin", None), options)
+    elif options.do == "choose":
         for field in options.fields:
             alone = list(pieces(make(field, torch.tensor([[-1.0] * 3, [1.0] * 3]), 0)))
             for label in options.scenes:

@@ -325,3 +325,51 @@ def test_replacing_by_what_was_made_of_raw_values_is_not_said() -> None:
         field.grid = nn.Parameter(torch.rand(1, 9, 2, 2, 2))
         handle.step(1)
         assert opened(field) == 6
+
+
+def steps(field: Voxels, handle: gridreg.Handle, first: int, last: int, write: Any = None) -> None:
+    for step in range(first, last):
+        handle.step(step)
+        field(torch.zeros(1, 9)).sum().backward()
+        if write is not None:
+            write()
+
+
+@pytest.mark.parametrize("grad", [True, False])
+def test_values_written_past_torch_s_counting_are_noticed(grad: bool) -> None:
+    field = Voxels()
+
+    def write() -> None:
+        with torch.set_grad_enabled(grad):
+            field.grid.data.clamp_(min=0.5)
+
+    handle = gridreg.apply(field, gridreg.FrequencyMask(GRID, until=1.0), total_steps=1000)
+    with pytest.warns(AttachWarning, match="grid: something wrote in place"):
+        steps(field, handle, 0, 12, write)
+    handle.remove()
+
+
+@pytest.mark.parametrize("how", ["data", "copy", "load"])
+def test_a_mask_written_into_its_parameter_is_noticed(how: str) -> None:
+    field = Voxels()
+    handle = gridreg.apply(field, gridreg.FrequencyMask(GRID, until=1.0), total_steps=1000)
+    steps(field, handle, 0, 20)
+    raw = dict(field.named_parameters())["grid"]
+    with torch.no_grad():
+        if how == "data":
+            raw.data.copy_(field.grid)
+        elif how == "copy":
+            raw.copy_(field.grid)
+        else:
+            field.load_state_dict({**field.state_dict(), "grid": field.grid.clone()})
+    with pytest.warns(AttachWarning, match=r"grid \(FrequencyMask\(grid\)\): a closed channel had values"):
+        steps(field, handle, 20, 30)
+    handle.remove()
+
+
+def test_a_grid_that_begins_with_zeros_is_no_loss() -> None:
+    field = Voxels()
+    with torch.no_grad():
+        field.grid.zero_()
+    with gridreg.apply(field, gridreg.FrequencyMask(GRID, until=1.0), total_steps=1000) as handle:
+        steps(field, handle, 0, 20)

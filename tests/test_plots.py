@@ -58,7 +58,7 @@ def test_a_handle_has_a_panel_for_all_that_follows_the_step() -> None:
 
 
 def test_without_matplotlib_one_line_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)
     with pytest.raises(gridreg.InputError, match="plot: matplotlib is not installed, expected it"):
         gridreg.Linear(0.0, 1.0).plot(10)
 

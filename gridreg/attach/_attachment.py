@@ -7,7 +7,7 @@ import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import count
-from typing import Any, Literal
+from typing import Any
 from weakref import WeakSet, ref
 
 from torch import Tensor, nn
@@ -17,7 +17,7 @@ from gridreg.attach._binding import READS_GRIDS, Binding, bindings_of, site_labe
 from gridreg.attach._hooks import attach, detach
 from gridreg.attach._instance_class import STACKS
 from gridreg.attach._methods import SuspendingMethod, resume, wrap
-from gridreg.attach._resolve import Match, find
+from gridreg.attach._resolve import Match, Part, find
 from gridreg.attach._slots import Slot, Stack
 from gridreg.attach._snapshot import Snapshot
 from gridreg.attach._state import bake, load_state, state_of
@@ -123,15 +123,15 @@ class Attachment:
         with binding.naming():
             for site in binding.regularizer.sites():
                 if binding.overrides(*READS_GRIDS):
-                    matches += self._found(self.field, site, "grids")
+                    matches += self._found(self.field, site, "grids", once=True)
                 if binding.overrides(Regularizer.transform):
                     found = self._found(self.field, site, type(binding.regularizer).acts_on)
                     slots += [(match, self._slot(binding, match)) for match in found]
         return matches, slots
 
-    def _found(self, field: nn.Module, site: SiteLike, part: Literal["mask", "grids"]) -> list[Match]:
+    def _found(self, field: nn.Module, site: SiteLike, part: Part, once: bool = False) -> list[Match]:
         """Matches of a site, at least one."""
-        matches = find(field, site, part)
+        matches = find(field, site, part, once)
         if not matches:
             wanted = "grid parameters" if part == "grids" else "a place for a mask"
             raise InputError(
@@ -180,9 +180,13 @@ class Attachment:
             with binding.naming():
                 for _, slot in binding.slots:
                     slot.refresh()
+        looks = self._steps % _notices.LOOKS == 1
         for stack in self.stacks():
             stack.forget()
             _notices.written(stack)
+            stack.looks = looks
+        if looks and self._snapshot is not None:
+            _notices.baked(self._snapshot.tensors)
         self._told = self._told or _notices.stale_copies(self)
 
     def stacks(self) -> list[Stack]:

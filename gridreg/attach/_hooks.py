@@ -18,6 +18,7 @@ from weakref import WeakSet
 import torch
 from torch import Tensor, nn
 from torch.nn.modules.module import register_module_parameter_registration_hook
+from torch.nn.parameter import is_lazy
 from torch.optim.optimizer import register_optimizer_step_pre_hook
 
 from gridreg.attach._instance_class import STACKS, set_instance_class
@@ -61,8 +62,13 @@ class InputHook:
 def _changed(slot: Slot, module: nn.Module, value: Any, item: int | str | None) -> Any:
     """`value`, a tensor or a container, with one tensor passed through the slot; None if nothing changes."""
     place = slot.context.place
+    # An entry of a named tuple, a dataclass, ...
+    named = isinstance(item, str) and not isinstance(value, Mapping)
     try:
-        tensor = value if isinstance(value, Tensor) and item is None else value[item]
+        if named:
+            tensor = getattr(value, str(item), None)
+        else:
+            tensor = value if isinstance(value, Tensor) and item is None else value[item]
     except (TypeError, KeyError, IndexError):
         tensor = None
     if not isinstance(tensor, Tensor):
@@ -80,6 +86,12 @@ def _changed(slot: Slot, module: nn.Module, value: Any, item: int | str | None) 
     if isinstance(value, MutableMapping):
         changed = copy.copy(value)
         changed[item] = result
+        return changed
+    if named:
+        if hasattr(value, "_replace"):
+            return value._replace(**{str(item): result})
+        changed = copy.copy(value)
+        object.__setattr__(changed, str(item), result)
         return changed
     # From the end as well: item=-1 is the last one.
     items = list(value)
@@ -166,7 +178,7 @@ def _parameter_registered(module: nn.Module, name: str, parameter: Tensor | None
     Slices and copies of a `ParameterList` or `ParameterDict` make such parameters in the middle of a forward pass:
     torch would cut their gradient off.
     """
-    if parameter is None or parameter.is_meta or not parameter.numel():
+    if parameter is None or is_lazy(parameter) or parameter.is_meta or not parameter.numel():
         return None
     for stack in tuple(MADE):
         made = stack.made

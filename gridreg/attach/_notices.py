@@ -23,6 +23,9 @@ class AttachWarning(UserWarning):
     """Something attached does not do what it seems to; the text says what to do."""
 
 
+LOOKS = 8
+"""Steps from one look for writes past torch's counting to the next."""
+
 PATIENCE = 3
 """Steps after which a regularizer that has had no effect is named."""
 
@@ -118,6 +121,18 @@ def written(stack: Stack) -> None:
         _warn(
             f"{'' if place is None else place.name}: something wrote in place into the masked tensor that the field "
             "reads, which leaves the parameter as it was; write inside handle.suspended()"
+        )
+
+
+def baked(tensors: Mapping[tuple[str, str], MaskedTensor]) -> None:
+    """Warn about parameters that were overwritten with what the field reads, closed channels and all."""
+    lost = [
+        f"{name} ({regularizer})" for (regularizer, name), (raw, slot) in tensors.items() if slot.lost(raw)
+    ]
+    if lost:
+        _warn(
+            f"{', '.join(lost)}: a closed channel had values, and is all 0 now. What wrote the masked values into the "
+            "parameter made the mask permanent; read and write inside handle.suspended()"
         )
 
 

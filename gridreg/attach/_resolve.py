@@ -10,16 +10,17 @@ from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
 from torch import Tensor, nn
+from torch.nn.parameter import is_lazy
 
 from gridreg.attach.sites import Grid, Place, Selector, Site, SiteLike, spatial_axes
 from gridreg.errors import InputError, near_names
 
-__all__ = ["Match", "find", "raw_tensor", "register_adapter", "sites_of"]
+__all__ = ["Match", "Part", "find", "raw_tensor", "register_adapter", "sites_of"]
 
 # DistributedDataParallel and DataParallel, and torch.compile.
 _WRAPPERS = re.compile(r"^((module|_orig_mod)\.)+")
 
-
+Part: TypeAlias = Literal["mask", "grids"]
 Adapter: TypeAlias = Callable[[nn.Module], Mapping[str, "Site | Selector"]]
 
 _ADAPTERS: dict[type[nn.Module], Adapter] = {}
@@ -120,13 +121,14 @@ def _prefixed(site: Site, prefix: str) -> Site:
     return Site(moved(site.selectors("mask")), moved(site.selectors("grids")))
 
 
-def find(field: nn.Module, site: SiteLike, part: Literal["mask", "grids"]) -> list[Match]:
+def find(field: nn.Module, site: SiteLike, part: Part, once: bool = False) -> list[Match]:
     """All tensors of a site, in the order of the field.
 
     Args:
         field: the module to look at.
         site: declared name, selector or `Site`.
         part: which of the site's selectors to follow.
+        once: tied parameters at one of the names that match, not at each.
 
     Raises:
         InputError: nothing matches (near names are listed), or the channel axis or the channels do not fit.
@@ -142,7 +144,7 @@ def find(field: nn.Module, site: SiteLike, part: Literal["mask", "grids"]) -> li
         site = by_path[site]
     if isinstance(site, Selector):
         site = Site((site,))
-    return [match for selector in site.selectors(part) for match in _find_selector(field, selector)]
+    return [match for selector in site.selectors(part) for match in _find_selector(field, selector, once)]
 
 
 _SITES = "nor does any part of it; name tensors with gridreg.parameters, outputs or inputs"
@@ -177,15 +179,20 @@ def _matching(pattern: str, names: Iterable[str]) -> list[str]:
     return [bare[name] for name in _matching(pattern, bare)]
 
 
-def _find_selector(field: nn.Module, selector: Selector) -> list[Match]:
+def _find_selector(field: nn.Module, selector: Selector, once: bool) -> list[Match]:
     """Matches of one selector."""
-    if selector.kind == "parameters":
-        matches = _find_parameters(field, selector)
+    if selector.kind != "parameters":
+        matches, once = _find_modules(field, selector), False
     else:
-        matches = _find_modules(field, selector)
+        matches = _find_parameters(field, selector)
+
+    def key(match: Match) -> tuple[int, str]:
+        owner, name = match.module, match.attribute
+        return (id(raw_tensor(owner, name)), "") if once else (id(owner), name)
+
     # A module or list that is reachable under two names holds one tensor: attach once.
-    unique = {(id(match.module), match.attribute): match for match in reversed(matches)}
-    return [match for match in matches if unique[id(match.module), match.attribute] is match]
+    unique = {key(match): match for match in reversed(matches)}
+    return [match for match in matches if unique[key(match)] is match]
 
 
 def _find_parameters(field: nn.Module, selector: Selector) -> list[Match]:
@@ -199,6 +206,9 @@ def _find_parameters(field: nn.Module, selector: Selector) -> list[Match]:
     if not names:
         raise InputError(_unknown(selector.pattern, list(named), "matches no parameter or buffer"))
     tensors = {name: named[name] for name in names}
+    for name, tensor in tensors.items():
+        if is_lazy(tensor):
+            raise InputError(f"{name}: is lazy, without a shape; call the field once before gridreg.apply")
     dims = {name: _checked_dim(name, tensor, selector) for name, tensor in tensors.items()}
     _check_sizes(tensors, dims, selector)
     matches = []

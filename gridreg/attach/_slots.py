@@ -36,6 +36,7 @@ class Slot:
         self.active = True
         self.closed: bytes | None = None
         self.read = False
+        self._filled = -1
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Made by copying or unpickling: nobody steps it, unless its handle came along."""
@@ -78,6 +79,15 @@ class Slot:
             return value
         return self.regularizer.transform(value, self.context)
 
+    def lost(self, raw: Tensor) -> bool:
+        """Whether a channel that is closed had values when this was asked last, and has none in the parameter now."""
+        channel = -1 if self.closed is None else self.closed.rfind(b"\1")
+        if channel < 0 or raw.is_meta or self.context.place is None:
+            return False
+        filled = bool(raw.detach().select(self.context.place.dim, channel).any())
+        before, self._filled = self._filled, channel if filled else -1
+        return not filled and before == channel
+
     def check(self, value: Tensor) -> None:
         """Learn the number of channels at the first call, and follow it if it changes."""
         place = self.context.place
@@ -110,19 +120,22 @@ class Stack:
         slots: in order.
         keep: above 0 inside `handle.cached()`: tensors made without gradients are handed out again as well.
         written: whether somebody wrote into a masked tensor, which no parameter will ever see.
+        looks: whether to look for writes that torch does not count (into `.data`), by a few values.
     """
 
     def __init__(self, slots: tuple[Slot, ...]) -> None:
         self.slots = slots
         self.keep = 0
         self.written = False
+        self.looks = False
         self._made: Tensor | None = None
         self._key: tuple[Any, ...] = ()
         self._version = 0
+        self._some: Tensor | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         """Without the masked tensor, which torch cannot copy."""
-        return {"slots": self.slots, "keep": 0, "written": False, "_made": None, "_key": (), "_version": 0}
+        return {**Stack(self.slots).__dict__}
 
     def __iter__(self) -> Iterator[Slot]:
         return iter(self.slots)
@@ -136,8 +149,9 @@ class Stack:
 
     def forget(self) -> None:
         """Make the tensor anew at the next read."""
-        if self.made is not None:
-            self._made = None
+        if self.made is not None and self._some is not None:
+            self.written |= not torch.allclose(_some(self._made), self._some, 0, 0, equal_nan=True)
+        self._made = self._some = None
 
     def __call__(self, raw: Tensor, training: bool) -> Tensor:
         """The tensor that the field sees instead of its parameter, or the parameter itself."""
@@ -158,7 +172,9 @@ class Stack:
             if made is raw:
                 return raw
             setattr(made, _MASKED, raw)
+            self.forget()
             self._made, self._key, self._version = made, key, made._version
+            self._some = _some(made) if self.looks and not made.is_meta else None
             MADE.add(self)
         return made
 
@@ -167,6 +183,15 @@ class Stack:
         for slot in self.slots:
             value = slot(value, training)
         return value
+
+
+def _some(made: Tensor | None) -> Tensor:
+    """A copy of a few values, evenly spread."""
+    assert made is not None
+    values = made.detach().flatten()
+    return (
+        values[torch.linspace(0, len(values) - 1, 64, device=made.device).long()] if len(values) else values
+    )
 
 
 MADE: WeakSet[Stack] = WeakSet()
@@ -186,6 +211,7 @@ def _plain(raw: Tensor) -> bool:
         and not torch.is_inference_mode_enabled()
         and not raw.is_inference()
         and not torch._C._are_functorch_transforms_active()
+        and torch._C._get_tracing_state() is None
         and torch._C._len_torch_dispatch_stack() == 0
         and not (raw.is_cuda and torch.cuda.is_current_stream_capturing())
     )
@@ -226,6 +252,9 @@ class _Shared(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, None]:
         holder = ctx.holder
         holder.stack.forget()
+        # Of an embedding with few rows read, which torch.where would not take.
+        rows = gradient.sparse_dim() if gradient.is_sparse else 0
+        gradient = gradient.to_dense() if rows else gradient
         # Through `source` to the parameter, so that second derivatives are right as well.
         (found,) = torch.autograd.grad(
             holder.target,
@@ -235,4 +264,4 @@ class _Shared(torch.autograd.Function):
             create_graph=torch.is_grad_enabled(),
             allow_unused=True,
         )
-        return found, None
+        return found.to_sparse(rows) if rows and found is not None else found, None

@@ -121,7 +121,7 @@ class Mask(Regularizer):
             scaled: Tensor = _ScaledGradient.apply(value, mask)  # type: ignore[no-untyped-call]
             return scaled
         # A product alone would let NaN and infinity through a closed channel.
-        return torch.where(mask > 0, value * mask, 0.0)
+        return torch.where(mask != 0, value * mask, 0.0)
 
     def value(self, context: Context) -> float:
         """Open share of the channels; 1 if there are none."""
@@ -147,12 +147,12 @@ class _ScaledGradient(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
         (mask,) = ctx.saved_tensors
-        return torch.where(mask > 0, gradient * mask, 0.0), None
+        return torch.where(mask != 0, gradient * mask, 0.0), None
 
     @staticmethod
     def jvp(ctx: Any, tangent: Tensor, _: None) -> Tensor:
         (mask,) = ctx.saved_tensors
-        return torch.where(mask > 0, tangent * mask, 0.0)
+        return torch.where(mask != 0, tangent * mask, 0.0)
 
 
 @lru_cache(maxsize=256)
