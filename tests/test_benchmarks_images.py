@@ -165,13 +165,15 @@ class TestSheet:
         return made / "truth"
 
     def scene(self, truth: Path, folder: Path) -> Path:
-        """A scene as `prepare` writes one, with the true cameras and masks: crops of 150 pixels at half the size."""
+        """A scene as `prepare` writes one, with the true cameras and masks: crops of 300 pixels at half the size."""
         content = json.loads((truth / "transforms.json").read_text())
         frames = []
         for name in ("images", "masks"):
             (folder / name).mkdir(parents=True)
         for frame in content["frames"][:6]:
-            left, top = (max(0, round(frame[key]) - 150) for key in ("cx", "cy"))
+            left, top = (
+                min(max(0, round(frame[c]) - 150), frame[n] - 300) for c, n in (("cx", "w"), ("cy", "h"))
+            )
             for key in ("file_path", "mask_path"):
                 with Image.open(truth / frame[key]) as image:
                     box = (left, top, left + 300, top + 300)
