@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent))
+import yaml
 from generated import write_or_check
 
 import gridreg
@@ -32,14 +33,17 @@ KINDS = {
     "O": "optimizer: options of the site's parameter groups",
 }
 
+FAMILIES = sorted((PAGE.parent / "families").glob("*.md"))
+FORMULAS: dict[str, str] = yaml.safe_load(PAGE.with_name("formulas.yaml").read_text(encoding="utf-8"))
+
 HEAD = """# Catalogue
 
-Every regularizer that `gridreg` registers, with its formula, defaults, unit and source. Defaults are those of
-the class, in the order of its arguments; `site` has none. A number may be a schedule or a function of the
-step.
-Behind each class is a plain function, which its documentation names.
+Every regularizer that `gridreg` registers, with its formula, defaults, unit and source. The name leads to its
+section, with images. Defaults are those of the class, in the order of its arguments; `site` has none. A number
+may be a schedule or a function of the step. Behind each class is a plain function, which its documentation
+names; `gridreg show regularizers NAME` prints that.
 
-Written by `python docs/make_catalogue.py` from the docstrings; edit those.
+Written by `python docs/make_catalogue.py` from the docstrings and `docs/formulas.yaml`; edit those.
 
 """
 
@@ -95,16 +99,21 @@ def defaults_of(cls: type[Regularizer]) -> str:
 
 
 def row_of(cls: type[Regularizer]) -> str:
-    """Row of the table."""
-    cells = [
-        f"`{cls.__name__}`",
-        kind_of(cls),
-        summary_of(cls),
-        entry_of(cls, "Formula"),
-        defaults_of(cls),
-        entry_of(cls, "Unit"),
-        entry_of(cls, "Source"),
-    ]
+    """Row of the table.
+
+    Raises:
+        SystemExit: if its docstring, the pages or the formulas lack something.
+    """
+    name = cls.__name__
+    places = [path.name for path in FAMILIES if f"\n## {name}\n" in path.read_text(encoding="utf-8")]
+    entry_of(cls, "Formula")
+    if not places or name not in FORMULAS:
+        raise SystemExit(
+            f"{name}: no section in docs/families/" if not places else f"{name}: not in formulas.yaml"
+        )
+    facts = f"{defaults_of(cls)}<br>unit: {entry_of(cls, 'Unit')}<br>*{entry_of(cls, 'Source')}*"
+    link = f"[`{name}`](families/{places[0]}#{name.lower()})"
+    cells = [link, kind_of(cls), f"{summary_of(cls)}<br>${FORMULAS[name]}$", facts]
     return "| " + " | ".join(cell.replace("|", "\\|").replace("``", "`") for cell in cells) + " |"
 
 
@@ -114,7 +123,7 @@ def page() -> str:
     classes = [cls for cls in REGISTRY.values() if cls.__module__.startswith(package)]
     classes.sort(key=lambda cls: (list(KINDS).index(kind_of(cls)), cls.__name__))
     kinds = "\n".join(f"* **{letter}** {meaning}" for letter, meaning in KINDS.items())
-    titles = ("regularizer", "kind", "what it does", "formula", "defaults", "unit", "source")
+    titles = ("regularizer", "kind", "what it does", "defaults, unit, source")
     head = f"| {' | '.join(titles)} |\n|{'---|' * len(titles)}\n"
     return f"{HEAD}{kinds}\n\n{head}" + "\n".join(map(row_of, classes)) + "\n"
 

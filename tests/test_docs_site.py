@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import re
+import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,7 +12,10 @@ from types import ModuleType
 from xml.etree import ElementTree
 
 import pytest
+import yaml
 
+from gridreg.base import REGISTRY
+from tests.chromium import open_page
 from tests.programs import module_at
 
 DOCS = Path(__file__).parent.parent / "docs"
@@ -73,7 +77,8 @@ def test_pages_show_every_diagram_with_a_description() -> None:
         for text, target in re.findall(r"!\[(.*?)\]\((.*?)\)", path.read_text(encoding="utf-8")):
             assert len(text.split()) >= 5, f"{path.name}: {target} needs a description"
             shown.add((path.parent / target).resolve())
-    assert shown == set((DOCS / "diagrams").resolve().glob("*.svg"))
+    images = (DOCS / "images").resolve().glob("*.webp")
+    assert shown == {*(DOCS / "diagrams").resolve().glob("*.svg"), *images}
 
 
 # --- the site's own code
@@ -162,3 +167,61 @@ Examples:
     >>> 2
     2"""
     )
+
+
+def test_formulas_become_mathml_and_stay_in_their_cell() -> None:
+    pytest.importorskip("latex2mathml", reason="latex2mathml, of the docs extra, is not installed")
+    hooks = module_at(DOCS / "web" / "hooks.py")
+    text = hooks.on_page_content(
+        r'<td><span class="arithmatex">\(\frac{a}{b} &lt; 1\)</span></td>', {"docs_dir": str(DOCS)}, page=None
+    )
+    assert "<math" in text
+    assert "<mfrac><mrow><mi>a</mi></mrow><mrow><mi>b</mi></mrow></mfrac>" in text
+    assert "arithmatex" not in text
+
+
+def test_every_formula_is_of_a_regularizer_and_can_be_set() -> None:
+    converter = pytest.importorskip("latex2mathml.converter", reason="latex2mathml is not installed")
+    formulas = yaml.safe_load((DOCS / "formulas.yaml").read_text(encoding="utf-8"))
+    assert formulas.keys() == {n for n, cls in REGISTRY.items() if cls.__module__.startswith("gridreg.")}
+    for formula in formulas.values():
+        assert "\\" not in ElementTree.tostring(ElementTree.fromstring(converter.convert(formula)), "unicode")
+
+
+def test_search_works_from_disk(tmp_path: Path) -> None:
+    """The site as ``mkdocs build`` has left it; .ci/run builds it first."""
+    site = DOCS.parent / "site"
+    if not (site / "search" / "search_index.js").is_file():
+        pytest.skip("no site: mkdocs build makes it")
+    with open_page(tmp_path, (1280, 900)) as tab:
+        tab.open(f"file://{site / 'index.html'}")
+        tab.evaluate("document.querySelector('.md-search__input').focus()")
+        tab.call("Input.insertText", text="occlusion")
+        tab.call("Input.dispatchKeyEvent", type="keyUp", key="n", code="KeyN")
+        tab.until(lambda: tab.evaluate("document.querySelectorAll('.md-search-result__item').length > 3"))
+        assert tab.evaluate("document.documentElement.scrollWidth <= innerWidth")
+        # A line of code of 100 characters is not cut.
+        tab.open(f"file://{site / 'own-field.html'}")
+        widths = "[...document.querySelectorAll('pre > code')].map(c => c.scrollWidth - c.clientWidth)"
+        assert max(tab.evaluate(widths)) <= 0
+        assert not tab.problems
+
+
+def test_images_are_those_that_were_made(capsys: pytest.CaptureFixture[str]) -> None:
+    status = module_at(DOCS / "make_images.py").main(["--check"])
+    assert status == 0, capsys.readouterr().out
+
+
+def test_wrong_images_are_noticed(tmp_path: Path) -> None:
+    make_images = module_at(DOCS / "make_images.py")
+    shutil.copytree(DOCS / "images", tmp_path / "images")
+    assert make_images.problems(tmp_path / "images") == []
+    (tmp_path / "images" / "mesh.webp").write_bytes(bytes(300_000))
+    (tmp_path / "images" / "stages.webp").unlink()
+    (tmp_path / "images" / "old.webp").write_bytes(b"")
+    assert make_images.problems(tmp_path / "images") == [
+        "old.webp: left over",
+        "stages.webp: missing",
+        "mesh.webp: another file than was made",
+        "mesh.webp: 300000 bytes",
+    ]

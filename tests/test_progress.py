@@ -201,6 +201,21 @@ def test_the_clock_stands_still_while_kernels_are_compiled():
     assert float(re.search(r"([\d.]+) it/s", log.getvalue())[1]) > 5
 
 
+def test_a_notebook_gets_a_bar_of_tqdm(clock):
+    file = io.StringIO()
+    with Progress(10, start=4, label="step", stream=file, clock=clock, notebook=True) as progress:
+        clock.now += 1
+        progress.update(7, psnr=20.0)
+        progress.message("above the bar")
+        clock.now += 1
+        progress.update(10, psnr=22.0)
+    text = file.getvalue()
+    assert "7/10" in text
+    assert "PSNR 22.00 dB" in text
+    assert "step: 100%" in text
+    assert "left" not in text
+
+
 def test_clock_time():
     assert clock_time(0) == "0:00"
     assert clock_time(59.6) == "1:00"

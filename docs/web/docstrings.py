@@ -7,10 +7,15 @@ and source of a regularizer stand on a line each.
 from __future__ import annotations
 
 import re
+from pathlib import Path
 from typing import Any
 
 import griffe
+import yaml
 
+_FORMULAS: dict[str, str] = yaml.safe_load(
+    Path(__file__).parents[1].joinpath("formulas.yaml").read_text(encoding="utf-8")
+)
 _ROLE = re.compile(r":(?:py:)?(?:func|class|meth|data|attr|mod):`~?([^`]+)`")
 _SECTIONS = ("Args:", "Attributes:", "Raises:")
 _ENTRY = re.compile(r" {4}(\*{0,2}[\w.]+(?:, \*{0,2}[\w.]+)*)((?: \([^)]*\))?:(?: .*|$))")
@@ -23,11 +28,13 @@ class Docstrings(griffe.Extension):
     def on_object(self, *, obj: griffe.Object, **kwargs: Any) -> None:
         """Rewrite one."""
         if obj.docstring is not None:
-            obj.docstring.value = readable(obj.docstring.value)
+            obj.docstring.value = readable(obj.docstring.value, _FORMULAS.get(obj.name, ""))
 
 
-def readable(text: str) -> str:
-    """A docstring, dedented, in the parser's form."""
+def readable(text: str, formula: str = "") -> str:
+    """A docstring, dedented, in the parser's form; with a formula in TeX before the one in plain text."""
+    if formula:
+        text = re.sub(r"^Formula: ", lambda _: f"Formula: ${formula}$; ", text, flags=re.M)
     text = _ROLE.sub(r"`\1`", text)
     paragraphs = re.split(r"\n(?:[ \t]*\n)+", text)
     return "\n\n".join(_paragraph(paragraph) for paragraph in paragraphs)

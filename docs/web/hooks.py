@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 _DIAGRAM = re.compile(r'<img alt="([^"]*)" src="(?:\.\./)*(diagrams/[\w-]+\.svg)" ?/?>')
+_FORMULA = re.compile(r'<span class="arithmatex">\\\((.*?)\\\)</span>', re.S)
 _FOREIGN = re.compile(
     r'<(?:script|img|iframe|source)\b[^>]*\bsrc="(?:https?:)?//[^"]*"'
     r'|<link\b[^>]*\bhref="(?:https?:)?//[^"]*"'
@@ -23,8 +24,15 @@ def on_config(config: Any) -> Any:
 
 
 def on_page_content(text: str, config: Any, **_: Any) -> str:
-    """A page's HTML with its diagrams inside, so that they follow the page's colours."""
-    return inlined(text, Path(config["docs_dir"]))
+    """A page's HTML with its diagrams inside, so that they follow the page's colours, and its formulas as MathML."""
+    return _FORMULA.sub(formula, inlined(text, Path(config["docs_dir"])))
+
+
+def formula(found: re.Match[str]) -> str:
+    """MathML of a formula in TeX: browsers draw it by themselves, so nothing is fetched and no script runs."""
+    from latex2mathml.converter import convert
+
+    return f'<span class="formula">{convert(html.unescape(found[1]))}</span>'
 
 
 def inlined(text: str, docs: Path) -> str:

@@ -13,6 +13,7 @@ from gridreg.training import (
     RunConfig,
     Trainer,
     TrainOptions,
+    Watch,
     build_trainer,
     configure,
     execute,
@@ -20,6 +21,7 @@ from gridreg.training import (
     output_folder,
 )
 from gridreg.training.record import summary
+from gridreg.training.tensorboard import TensorBoard
 
 __all__ = ["run"]
 
@@ -42,6 +44,7 @@ def run(
     with live_view(options.view, options.host, options.port) as look:
         config, device = configure(options), choose_device(options.device)
         check_drawing(video=options.video)
+        boards = [TensorBoard()] if options.tensorboard else []
         out = output_folder(options, config)
         scene = open_scene(config, cache=Path("outputs")).to(device)
         print(
@@ -49,9 +52,10 @@ def run(
             f"{scene.train.width}x{scene.train.height}; results go to {out}",
             flush=True,
         )
+        watching: list[Watch] = [*boards, *([] if look is None else [look])]
         command = command or ["gridreg", *sys.argv[1:]]
         execution, metrics = execute(
-            config, scene, out, resume=options.resume, command=command, watch=look, make=make
+            config, scene, out, resume=options.resume, command=command, watch=watching, make=make
         )
         if metrics is None:
             return 130

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
 import sys
 from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from gridreg.cli.arguments import Checkpoint, OptionalFolder
 from gridreg.machine import DeviceName, choose_device
+
+if TYPE_CHECKING:
+    from gridreg.training import LoadedRun
 
 __all__ = ["ViewOptions", "run"]
 
@@ -38,6 +45,7 @@ def run(options: ViewOptions) -> int:
     from gridreg.cli.runs import folder_of, views_scene
     from gridreg.export import Viewer
     from gridreg.export.browser import check_address
+    from gridreg.export.runs import smoothed
     from gridreg.training import load_run
 
     check_address(options.host, options.port)
@@ -46,8 +54,33 @@ def run(options: ViewOptions) -> int:
     if scene is None:
         print(f"{loaded.config.scene}: not there any more, so no training cameras", file=sys.stderr)
     views = None if scene is None else scene.train
-    with Viewer(loaded, views, host=options.host, port=options.port, size=options.size) as viewer:
+    title, curve = described(loaded, folder_of(options.checkpoint))
+    with Viewer(
+        loaded, views, host=options.host, port=options.port, size=options.size, title=title
+    ) as viewer:
         if loaded.warp is None:
             viewer.offer_crop(folder_of(options.checkpoint) / "crop.json", loaded.field.bounds, loaded.world)
+        viewer.curve(*smoothed(curve))
         viewer.wait()
     return 0
+
+
+def described(run: LoadedRun, folder: Path) -> tuple[str, list[tuple[float, float]]]:
+    """The title of a run's page (its name, score and scene), and its PSNR by iteration, as far as its files tell.
+
+    Args:
+        run: the checkpoint.
+        folder: that it lies in; files there that are damaged tell nothing.
+    """
+    parts: list[str] = [folder.resolve().name]
+    curve: list[tuple[float, float]] = []
+    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+        metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+        parts.append(f"{float(metrics['mean']['psnr']):.2f} dB")
+    parts.append("built-in scene" if run.config.scene is None else Path(run.config.scene).name)
+    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+        rows = [
+            json.loads(line) for line in (folder / "history.jsonl").read_text(encoding="utf-8").splitlines()
+        ]
+        curve = [(float(row["step"]), float(row["psnr"])) for row in rows if "psnr" in row]
+    return ", ".join(parts), curve

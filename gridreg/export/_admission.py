@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import hmac
+import html
 import http
+import logging
 import math
 import os
 import secrets
@@ -26,6 +28,9 @@ MOST_PER_SECOND = 200
 """Messages that one browser may send; a camera in motion sends sixty."""
 LARGEST_WINDOW = 8192
 """Pixels along an edge."""
+_SILENT = logging.getLogger("gridreg.viewer")
+_SILENT.addHandler(logging.NullHandler())
+_SILENT.propagate = False
 _CAMERA = {"wxyz": 4, "position": 3, "look_at": 3, "up_direction": 3, "fov": 0, "near": 0, "far": 0}
 _TYPES = ("ViewerCameraMessage", "GuiUpdateMessage", "SceneNodeClickMessage")
 
@@ -40,9 +45,11 @@ class Admission:
 
     Args:
         host: address that the server listens on.
+        title: of the page, in the browser's tab.
     """
 
-    def __init__(self, host: str) -> None:
+    def __init__(self, host: str, title: str = "gridreg") -> None:
+        self.title = title
         self.local = host in LOOPBACK
         self.token = secrets.token_urlsafe(16)
         self.needs_token = not (self.local and Path("/proc/net/tcp").is_file())
@@ -61,15 +68,26 @@ class Admission:
                 await handler(connection)
 
             def guarded(connection: Any, request: Any) -> Any:
-                refused = self.refusal(connection, request)
-                if refused is not None:
-                    return connection.respond(*refused)
-                response = process_request(connection, request)
+                try:
+                    refused = self.refusal(connection, request)
+                    if refused is not None:
+                        return connection.respond(*refused)
+                    page = urlsplit(request.path).path in ("/", "/index.html")
+                    if page and "Accept-Encoding" in request.headers:
+                        # Uncompressed, so that its title can be set.
+                        del request.headers["Accept-Encoding"]
+                    response = process_request(connection, request)
+                # A path or an address that is none.
+                except (ValueError, OSError):
+                    return connection.respond(http.HTTPStatus.BAD_REQUEST, "viewer: a strange request\n")
                 if response is not None:
+                    self._entitle(response)
                     self._seal(response, request, connection)
                 return response
 
             options["max_size"] = MOST_BYTES
+            # Whatever arrives at the port that is no HTTP is no news for whoever trains.
+            options["logger"] = _SILENT
             return original(bounded, *address, process_request=guarded, **options)
 
         with mock.patch.object(sockets, "serve", serve):
@@ -102,6 +120,15 @@ class Admission:
     def _cookie(self, connection: Any) -> str:
         """Cookies of one host are shared by all its ports."""
         return f"gridreg-{connection.local_address[1]}"
+
+    def _entitle(self, response: Any) -> None:
+        body = response.body.replace(
+            b"<title>Viser</title>", f"<title>{html.escape(self.title)}</title>".encode()
+        )
+        if body != response.body:
+            response.body = body
+            del response.headers["Content-Length"]
+            response.headers["Content-Length"] = str(len(body))
 
     def _seal(self, response: Any, request: Any, connection: Any) -> None:
         response.headers["X-Frame-Options"] = "DENY"

@@ -5,23 +5,34 @@ from __future__ import annotations
 import importlib.util
 import math
 import socket
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from PIL import Image
 from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
 from torch import Tensor
 
 from gridreg.errors import InputError
 from gridreg.export._admission import Admission
+from gridreg.export.cameras import Orbit
 from gridreg.rendering.cameras import Camera, Lens
 from gridreg.scenes import Views
 
-__all__ = ["add_frustums", "camera_of", "check_address", "image_shape", "quiet_console", "start_server"]
+__all__ = [
+    "add_frustums",
+    "camera_of",
+    "check_address",
+    "fit_upright",
+    "go_to",
+    "image_shape",
+    "place_camera",
+    "quiet_console",
+    "start_server",
+]
 
 # The browser's cameras look along +z with y down (OpenCV).
 _FLIP = np.diag([1.0, -1.0, -1.0])
@@ -79,7 +90,7 @@ def start_server(host: str, port: int, admission: Admission | None = None) -> An
 
     admission = Admission(host) if admission is None else admission
     with quiet_console(), admission.at_the_door():
-        server = viser.ViserServer(host=host, port=port, label="gridreg", verbose=False)
+        server = viser.ViserServer(host=host, port=port, label=admission.title, verbose=False)
     admission.server = server._websock_server
     if server.get_port() != port:
         server.stop()
@@ -110,8 +121,19 @@ def camera_of(client: Any, shape: tuple[int, int], width: int) -> Camera:
     return Camera(torch.from_numpy(pose).float(), lens)
 
 
-def add_frustums(server: Any, views: Views, background: Tensor, depth: float) -> None:
-    """The cameras of views with their images ``depth`` world units before them; a click goes there."""
+def add_frustums(
+    server: Any, views: Views, background: Tensor, depth: float, clicked: Callable[[Any, int], None]
+) -> dict[int, Any]:
+    """The cameras of views with their images ``depth`` world units before them, by number.
+
+    Args:
+        server: a ``viser.ViserServer``.
+        views: the cameras; of more than a hundred not all are shown.
+        background: ``(3,)`` behind the images.
+        depth: world units.
+        clicked: called with the ``viser.ClientHandle`` and the number of the view that was clicked.
+    """
+    found = {}
     images = (views.composited(background.cpu()) * 255).round().to(torch.uint8).cpu().numpy()
     stride = max(1, math.ceil(len(views) / _MOST_FRUSTUMS))
     for i in range(0, len(views), stride):
@@ -133,13 +155,33 @@ def add_frustums(server: Any, views: Views, background: Tensor, depth: float) ->
             wxyz=(w, x, y, z),
             position=pose[:3, 3],
         )
-        frustum.on_click(_goes_to(pose))
+        frustum.on_click(partial(_clicked, clicked, i))
+        found[i] = frustum
+    return found
 
 
-def _goes_to(pose: NDArray[np.float64]) -> Any:
-    def clicked(event: Any) -> None:
-        with event.client.atomic():
-            event.client.camera.position = pose[:3, 3]
-            event.client.camera.look_at = pose[:3, 3] - np.linalg.norm(pose[:3, 3]) * pose[:3, 2]
+def place_camera(server: Any, orbit: Orbit, share: float, angle: float) -> None:
+    """Set the first camera of every browser: on an orbit, a share of its radius away, an angle of view in radians."""
+    server.scene.set_up_direction(tuple(float(v) for v in orbit.up))
+    camera, place = server.initial_camera, orbit.pose(0.0).double().numpy()[:3, 3]
+    camera.position = orbit.centre + share * (place - orbit.centre)
+    camera.look_at, camera.up, camera.fov = orbit.centre, orbit.up, angle
 
-    return clicked
+
+def _clicked(clicked: Callable[[Any, int], None], number: int, event: Any) -> None:
+    clicked(event.client, number)
+
+
+def go_to(client: Any, pose: Tensor) -> None:
+    """Move a browser's camera to a camera-to-world pose ``(4, 4)``, turned to the scene's middle distance."""
+    place = pose.double().cpu().numpy()
+    with client.atomic():
+        client.camera.position = place[:3, 3]
+        client.camera.look_at = place[:3, 3] - np.linalg.norm(place[:3, 3]) * place[:3, 2]
+
+
+def fit_upright(client: Any, angle: float) -> None:
+    """On a window that is higher than wide, such as a telephone's, give its width the angle, radians."""
+    height, width = client.camera.image_height, client.camera.image_width
+    if height > width > 0:
+        client.camera.fov = 2 * math.atan(math.tan(angle / 2) * height / width)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,12 +17,13 @@ from gridreg.export.page import write_page
 from gridreg.export.video import render_video
 from gridreg.export.viewer import Viewer
 from gridreg.export.writers import find_ffmpeg
+from gridreg.ops.compilation import clock_stopped
 from gridreg.rendering.cameras import Camera
 from gridreg.rendering.model import Model
 from gridreg.scenes import Views
 
 if TYPE_CHECKING:
-    from gridreg.training import Execution, StepReport, Trainer
+    from gridreg.training import Execution, StepReport
 
 __all__ = [
     "LiveView",
@@ -120,18 +122,33 @@ class LiveView:
         # Before anything is loaded or written.
         check_address(host, port)
         self._host, self._port = host, port
-        self._trainer: Trainer | None = None
+        self._run: Execution | None = None
+        self._psnr: list[tuple[float, float]] = []
         self.viewer: Viewer | None = None
 
     def start(self, run: Execution) -> None:
         """Open the page on the untrained field."""
-        self._trainer = run.trainer
-        self.viewer = Viewer(run.trainer.model, run.scene.train, host=self._host, port=self._port)
+        self._run = run
+        self.viewer = Viewer(
+            run.trainer.model,
+            run.scene.train,
+            host=self._host,
+            port=self._port,
+            title=f"{run.out.name}, {run.scene.name}, {run.scene.protocol}",
+            pausable=True,
+        )
 
     def step(self, report: StepReport) -> None:
-        """Show the field as it is now, if somebody looks and the last copy is old."""
-        if self.viewer is not None and self.viewer.wants_update:
+        """Show the field as it is now, if somebody looks and the last copy is old; wait while it is paused."""
+        if self.viewer is None or self._run is None:
+            return
+        self._psnr.append((self._run.trainer.step, report["psnr"]))
+        if self.viewer.wants_update:
             self._update()
+        if self.viewer.paused:
+            with clock_stopped():
+                while self.viewer.paused and not self._run.stopping():
+                    time.sleep(0.1)
 
     def finish(self) -> None:
         """Show the final field, and stay as long as a browser shows the page."""
@@ -146,8 +163,22 @@ class LiveView:
             self.viewer.close()
 
     def _update(self) -> None:
-        if self.viewer is not None and self._trainer is not None:
-            self.viewer.update(self._trainer.model)
+        if self.viewer is not None and self._run is not None:
+            self.viewer.update(self._run.trainer.model)
+            self.viewer.curve(*smoothed(self._psnr))
+
+
+def smoothed(points: Sequence[tuple[float, float]], most: int = 200) -> tuple[list[float], list[float]]:
+    """A curve of at most so many points: means of neighbours.
+
+    Example:
+        >>> smoothed([(1, 2.0), (2, 4.0), (3, 6.0)], most=2)
+        ([1.5, 3.0], [3.0, 6.0])
+    """
+    width = max(1, -(-len(points) // most))
+    groups = [points[i : i + width] for i in range(0, len(points), width)]
+    x, y = ([sum(p[axis] for p in group) / len(group) for group in groups] for axis in (0, 1))
+    return x, y
 
 
 @contextmanager

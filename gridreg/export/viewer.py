@@ -8,41 +8,43 @@ import math
 import sys
 import threading
 import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from PIL import Image
 from torch import Tensor
 
+from gridreg.export import browser
 from gridreg.export._admission import Admission
-from gridreg.export.browser import add_frustums, camera_of, image_shape, quiet_console, start_server
+from gridreg.export.browser import quiet_console, start_server
 from gridreg.export.cameras import orbit_of_box, orbit_of_views
-from gridreg.export.images import colour_bar, depth_range, to_image, z_depth
+from gridreg.export.images import z_depth
 from gridreg.export.pace import Pace
 from gridreg.export.preview import Preview
+from gridreg.export.training_cameras import TrainingCameras
 from gridreg.export.viewer_crop import CropControls
 from gridreg.export.viewer_panel import Look, Panel
+from gridreg.export.viewer_screen import Screen, composed
 from gridreg.rendering import Rendered
 from gridreg.rendering.cameras import Camera
 from gridreg.rendering.model import Model
 from gridreg.scenes import Views, World
-from gridreg.training.images import ImageArray
 
 __all__ = ["Viewer"]
 
 # Seconds without movement after which the image is sharpened.
 _REST = 0.25
+# Of the window's height, or of its width if that is less.
+_ANGLE = math.radians(50.0)
 
 
 class Viewer:
-    """A page with the field in it: orbit camera, training cameras, colour, depth, opacity, masks at any step.
+    """A page with the field in it: orbit camera, training cameras, colour, depth, opacity, masks at any step, curves.
 
-    A thread of its own draws a private copy of the model (`Preview`), so nothing that is set in the page
-    changes the field. A trainer gives new copies between two iterations, when one is wanted::
-
-        if viewer.wants_update:
-            viewer.update(Model(trainer.field, trainer.occupancy, trainer.march, background, trainer.handle))
-
+    A thread of its own draws a private copy of the model (`Preview`), so nothing that is set in the page changes the
+    field. A trainer gives new copies between two iterations, when one is wanted (``viewer.update(trainer.model)``).
     Nothing is copied or drawn while no browser looks.
 
     Args:
@@ -53,6 +55,8 @@ class Viewer:
         size: longer edge of the image at rest, pixels; can be changed in the page.
         refresh: least time between two copies of a field in training, seconds.
         quiet: do not say on standard error where the page is.
+        title: of the page.
+        pausable: whether the page has a button that sets `paused`.
 
     Raises:
         InputError: without viser, if the port is taken, or if the host is none of this machine's.
@@ -68,19 +72,23 @@ class Viewer:
         size: int = 512,
         refresh: float = 2.0,
         quiet: bool = False,
+        title: str = "gridreg",
+        pausable: bool = False,
     ) -> None:
         self._preview = Preview(model)
-        self._admission = Admission(host)
+        self._admission = Admission(host, title)
         self._server = start_server(host, port, self._admission)
         self.host, self.port = host, int(self._server.get_port())
         self._refresh, self._updated = refresh, time.monotonic()
         self._news = threading.Condition()
-        self._screens: dict[int, _Screen] = {}
-        self._wishes: list[Any] = []
+        self._screens: dict[int, Screen] = {}
+        self._wishes: list[tuple[Callable[[Any], None], Any]] = []
         self._closed = False
         self._pace = Pace()
         steps = (self._preview.step, self._preview.total_steps)
-        self._panel = Panel(self._server, self._preview.masks, steps, self._touch, self._wish, size)
+        masks = self._preview.masks
+        self._panel = Panel(self._server, masks, steps, self._touch, self._wish, size, pausable=pausable)
+        self.curve = self._panel.curve
         self._stand(model, views)
         self._server.on_client_connect(self._connected)
         self._server.on_client_disconnect(self._disconnected)
@@ -102,6 +110,11 @@ class Viewer:
     def wants_update(self) -> bool:
         """True if somebody looks and the copy is old; cheap enough to ask at every iteration."""
         return bool(self._screens) and time.monotonic() - self._updated > self._refresh
+
+    @property
+    def paused(self) -> bool:
+        """True while somebody who looks wants the training to wait; with nobody looking it goes on."""
+        return self._panel.paused and self.watched
 
     def update(self, model: Model) -> None:
         """Show a new state of the field; it is copied here and now, in the caller's thread.
@@ -153,22 +166,16 @@ class Viewer:
         """Place the first camera, and the training cameras."""
         bounds: Tensor = model.field.bounds
         seen = views is not None and len(views) > 0
-        orbit = orbit_of_views(views, bounds) if seen and views is not None else orbit_of_box(bounds)
-        self._server.scene.set_up_direction(tuple(float(v) for v in orbit.up))
-        camera = self._server.initial_camera
+        orbit = orbit_of_views(views, bounds) if views is not None and seen else orbit_of_box(bounds)
         # Inside the ring of training cameras, which would stand in the way.
-        place = orbit.pose(0.0).double().numpy()[:3, 3]
-        camera.position = orbit.centre + (0.8 if seen else 1.0) * (place - orbit.centre)
-        camera.look_at, camera.up, camera.fov = orbit.centre, orbit.up, math.radians(50.0)
-        self._frustums = self._server.scene.add_frame("/cameras", show_axes=False)
-        if seen and views is not None:
-            add_frustums(self._server, views, model.background, 0.12 * orbit.radius)
-        show = self._panel.cameras
-        show.visible = seen
-        show.on_update(lambda _: setattr(self._frustums, "visible", bool(show.value)))
+        browser.place_camera(self._server, orbit, 0.8 if seen else 1.0, _ANGLE)
+        visited, depth = partial(self._ask, self._compare), 0.12 * orbit.radius
+        self._cameras = TrainingCameras(self._server, views, model.background, depth, visited)
+        self._panel.cameras.visible = seen
+        self._panel.cameras.on_update(lambda event: self._cameras.show(bool(event.target.value)))
 
     def _connected(self, client: Any) -> None:
-        screen = _Screen(client)
+        screen = Screen(client)
         with self._news:
             self._screens[client.client_id] = screen
             self._news.notify_all()
@@ -176,6 +183,10 @@ class Viewer:
         @client.camera.on_update  # type: ignore[untyped-decorator]
         def _(_: Any) -> None:
             screen.moved = time.monotonic()
+            if not screen.placed:
+                screen.placed = True
+                browser.fit_upright(client, _ANGLE)
+            self._cameras.come_back(client.camera.position)
             self._touch(screen)
 
         self._touch(screen)
@@ -184,7 +195,7 @@ class Viewer:
         with self._news:
             self._screens.pop(client.client_id, None)
 
-    def _touch(self, *screens: _Screen) -> None:
+    def _touch(self, *screens: Screen) -> None:
         """Have screens (none named: all) drawn anew."""
         with self._news:
             for screen in screens or tuple(self._screens.values()):
@@ -192,9 +203,12 @@ class Viewer:
             self._news.notify_all()
 
     def _wish(self, client: Any) -> None:
+        self._ask(self._save, client)
+
+    def _ask(self, action: Callable[[Any], None], of: Any) -> None:
         with self._news:
-            if client not in self._wishes:
-                self._wishes.append(client)
+            if (action, of) not in self._wishes:
+                self._wishes.append((action, of))
             self._news.notify_all()
 
     # --- drawing; in the viewer's thread
@@ -212,7 +226,7 @@ class Viewer:
                 wanted = 0 if screen is None else screen.wanted
             try:
                 if wish is not None:
-                    self._save(wish)
+                    wish[0](wish[1])
                 elif screen is not None:
                     self._draw(screen)
             # Whatever goes wrong here must not end the training beside it; the page says what it was.
@@ -222,7 +236,7 @@ class Viewer:
                 reason = (str(error).splitlines() or [""])[0]
                 self._panel.say(f"**cannot draw:** {type(error).__name__}: {reason}")
 
-    def _next(self) -> tuple[_Screen | None, float | None]:
+    def _next(self) -> tuple[Screen | None, float | None]:
         """The screen to draw now, else how long to wait for one to come to rest, seconds."""
         screens = list(self._screens.values())
         waiting = [screen for screen in screens if screen.drawn != screen.wanted]
@@ -236,22 +250,22 @@ class Viewer:
         pause, screen = min(blurred, key=lambda pair: pair[0])
         return (screen, None) if pause <= 0 else (None, pause)
 
-    def _draw(self, screen: _Screen) -> None:
+    def _draw(self, screen: Screen) -> None:
         wanted, look = screen.wanted, self._panel.look
         screen.served = time.monotonic()
-        shape = image_shape(screen.client, look.size)
+        shape = browser.image_shape(screen.client, look.size)
         if screen.drawn != wanted:
             width = self._pace.moving(shape[1], shape[1] / shape[0])
         else:
             width = self._pace.sharper(screen.width, shape[1])
-        camera = camera_of(screen.client, shape, width)
+        camera = browser.camera_of(screen.client, shape, width)
         start = time.monotonic()
         # A first image is always finished: something must be seen during a long movement.
         rendered = self._render(camera, look, None if screen.drawn != wanted else screen, wanted)
         if rendered is None:
             return
         self._pace.saw(camera.lens.height * camera.lens.width, time.monotonic() - start)
-        pixels, note = _composed(rendered, look)
+        pixels, note = composed(rendered, look)
         # Where rays are warped, distances are not the world's, and no camera can be hidden by them.
         depth = None if self._preview.warped else z_depth(rendered, camera.lens.intrinsics)
         screen.client.scene.set_background_image(pixels, format="jpeg", jpeg_quality=90, depth=depth)
@@ -261,40 +275,26 @@ class Viewer:
         step += "" if look.step is None else f"masks at step {look.step}, "
         self._panel.say(f"{step}{camera.lens.width}x{camera.lens.height} in {seconds:.2f} s{note}")
 
-    def _render(self, camera: Camera, look: Look, screen: _Screen | None, wanted: int) -> Rendered | None:
+    def _render(self, camera: Camera, look: Look, screen: Screen | None, wanted: int) -> Rendered | None:
         def given_up() -> bool:
             return self._closed or (screen is not None and screen.wanted != wanted)
 
         return self._preview.at(look.step, look.off).render(camera, chunk=1 << 13, stop=given_up)
 
+    def _compare(self, number: int) -> None:
+        """Show the render of a training view beside its photograph."""
+        look = self._panel.look
+        found = self._cameras.comparison(self._preview.at(look.step, look.off), number, lambda: self._closed)
+        if found is not None:
+            self._panel.compare(*found)
+
     def _save(self, client: Any) -> None:
         """Send the image that a client sees, at full resolution, as a file."""
         look = self._panel.look
-        shape = image_shape(client, look.size)
-        rendered = self._render(camera_of(client, shape, shape[1]), look, None, 0)
+        shape = browser.image_shape(client, look.size)
+        rendered = self._render(browser.camera_of(client, shape, shape[1]), look, None, 0)
         if rendered is not None:
             file = io.BytesIO()
-            Image.fromarray(_composed(rendered, look)[0]).save(file, format="PNG")
+            Image.fromarray(composed(rendered, look)[0]).save(file, format="PNG")
             name = f"gridreg_{look.mode}_{time.strftime('%Y%m%d_%H%M%S')}.png"
             client.send_file_download(name, file.getvalue(), save_immediately=True)
-
-
-class _Screen:
-    """State of one browser: it is drawn when ``wanted`` is ahead, and until it is sharp."""
-
-    def __init__(self, client: Any) -> None:
-        self.client = client
-        self.wanted, self.drawn = 1, 0
-        self.width, self.sharp = 0, False
-        self.moved, self.served = 0.0, 0.0
-
-
-def _composed(rendered: Rendered, look: Look) -> tuple[ImageArray, str]:
-    """Return the image for the page, and a note about it."""
-    if look.mode != "depth":
-        return to_image(rendered, look.mode), ""
-    depths = depth_range([rendered])
-    pixels = to_image(rendered, "depth", depths)
-    if pixels.shape[1] >= 200 and pixels.shape[0] >= 64:
-        pixels[:, -64:] = colour_bar(pixels.shape[0], depths)
-    return pixels, f", depth {depths[0]:.3g} to {depths[1]:.3g}"

@@ -13,6 +13,7 @@ from contextlib import contextmanager
 __all__ = ["compile_seconds", "telling_compilation", "work_clock"]
 
 _spent = 0.0
+_stood = 0.0
 _read = 0
 _tell: Callable[[int | None], None] | None = None
 
@@ -23,13 +24,24 @@ def compile_seconds() -> float:
 
 
 def work_clock() -> float:
-    """Seconds of a clock that stands still while kernels are compiled.
+    """Seconds of a clock that stands still while kernels are compiled, and in `clock_stopped`.
 
     Example:
         >>> work_clock() <= work_clock()
         True
     """
-    return time.perf_counter() - _spent
+    return time.perf_counter() - _spent - _stood
+
+
+@contextmanager
+def clock_stopped() -> Iterator[None]:
+    """A block, such as a pause that somebody asked for, in which `work_clock` stands still."""
+    global _stood
+    began = time.perf_counter()
+    try:
+        yield
+    finally:
+        _stood += time.perf_counter() - began
 
 
 @contextmanager

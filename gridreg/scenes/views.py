@@ -14,6 +14,7 @@ from torch import Tensor
 
 from gridreg.errors import InputError
 from gridreg.scenes.gate import check_cameras, check_extent
+from gridreg.scenes.notebook import card, thumbnails
 from gridreg.scenes.silhouettes import silhouettes
 
 __all__ = ["IN_PLACE", "Scene", "Views", "World", "background_colour"]
@@ -87,7 +88,7 @@ IN_PLACE = World()
 """The world of a scene that stays where its files have it."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Views:
     """Images of one size with their cameras.
 
@@ -122,6 +123,9 @@ class Views:
 
     def __len__(self) -> int:
         return int(self.rgba.shape[0])
+
+    def __repr__(self) -> str:
+        return f"Views({len(self)} of {self.width}x{self.height})"
 
     @property
     def height(self) -> int:
@@ -197,7 +201,7 @@ class Views:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Scene:
     """A scene under a protocol, ready for training.
 
@@ -248,3 +252,11 @@ class Scene:
     def __post_init__(self) -> None:
         positions = torch.cat([views.poses[:, :3, 3].cpu() for views in (self.train, self.test)])
         check_extent(self.near, self.far, self.bounds.cpu(), positions)
+
+    def __repr__(self) -> str:
+        return f"Scene({self.name!r}, {self.protocol}, train={self.train!r}, test={self.test!r})"
+
+    def _repr_html_(self) -> str:
+        """The training views as notebooks show them."""
+        facts = f"{self.protocol}: {self.train!r} to train on, {self.test!r} to score on"
+        return card(self.name, facts, thumbnails(self.train.composited(self.background)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ import torch
 from gridreg.errors import InputError
 from gridreg.ops.compilation import work_clock
 from gridreg.scenes import Scene
+from gridreg.scenes.notebook import card
 from gridreg.training.checkpoint import has_checkpoint
 from gridreg.training.config import save_yaml, to_data
 from gridreg.training.curves import History, draw_curves, draw_masks
@@ -43,7 +45,7 @@ class Watch(Protocol):
         ...
 
 
-@dataclass
+@dataclass(repr=False)
 class Execution:
     """A run under way.
 
@@ -54,6 +56,7 @@ class Execution:
         trainer: where it stands.
         history: its curves so far.
         seconds: by phase: ``setup``, ``train``, ``test``; compiling kernels, once a machine, is left out.
+        stopping: whether somebody has asked it to stop.
     """
 
     config: RunConfig
@@ -62,11 +65,25 @@ class Execution:
     trainer: Trainer
     history: History
     seconds: dict[str, float]
+    stopping: Callable[[], bool] = lambda: False
 
     @property
     def checkpoint(self) -> Path:
         """Folder of the checkpoint."""
         return self.out / "checkpoint"
+
+    def __repr__(self) -> str:
+        return f"Execution({str(self.out)!r}, {self.scene!r}, step {self.trainer.step} of {self.config.train.steps})"
+
+    def _repr_html_(self) -> str:
+        """The run as notebooks show it: where it stands, and its test views once they are scored."""
+        metrics, sheet = self.out / "metrics.json", self.out / "test.png"
+        score = json.loads(metrics.read_text(encoding="utf-8"))["mean"] if metrics.is_file() else {}
+        facts = [f"step {self.trainer.step} of {self.config.train.steps}"]
+        facts += [f"{name} {value}" for name, value in score.items()]
+        return card(
+            str(self.out), ", ".join(facts), [sheet.read_bytes()] if score and sheet.is_file() else []
+        )
 
     def save(self) -> None:
         """Write the checkpoint.
@@ -207,7 +224,7 @@ def execute(
     resume: bool = False,
     command: Sequence[str] = (),
     on_step: Any = None,
-    watch: Watch | None = None,
+    watch: Watch | Sequence[Watch] | None = None,
     make: Callable[[RunConfig, Scene], Trainer] = build_trainer,
 ) -> tuple[Execution, dict[str, Any] | None]:
     """Train, score and record one run.
@@ -222,7 +239,7 @@ def execute(
         resume: go on from the checkpoint in ``out``.
         command: the command line, for the record.
         on_step: called with the `StepReport` of every iteration.
-        watch: told when the run starts, and of every iteration.
+        watch: told when the run starts, and of every iteration; one or several.
         make: makes the trainer at step 0.
 
     Returns:
@@ -252,16 +269,18 @@ def execute(
             )
         times["setup"] = times.get("setup", 0.0) + work_clock() - began
         run = Execution(config, scene, folder, trainer, history, times)
-        if watch is not None:
-            watch.start(run)
+        watching = () if watch is None else tuple(watch) if isinstance(watch, Sequence) else (watch,)
+        for each in watching:
+            each.start(run)
         save_yaml(
             folder / "config.yaml",
             config,
             comment="Everything that determines this run; pass it with --config.",
         )
         with interruptible() as interruption:
+            run.stopping = lambda: interruption.requested
             with Progress(config.train.steps, start=trainer.step) as progress:
-                finished = run.train(progress, interruption, _both(on_step, watch))
+                finished = run.train(progress, interruption, _all(on_step, watching))
             if not finished:
                 print(f"stopped at step {trainer.step}; go on with --resume --out {folder}", file=sys.stderr)
                 return run, None
@@ -270,12 +289,10 @@ def execute(
         return run, run.record(scored, command)
 
 
-def _both(on_step: Any, watch: Watch | None) -> Any:
-    if watch is None:
-        return on_step
-
+def _all(on_step: Any, watching: Sequence[Watch]) -> Any:
     def each(report: StepReport) -> None:
-        watch.step(report)
+        for watch in watching:
+            watch.step(report)
         if on_step is not None:
             on_step(report)
 

@@ -16,6 +16,7 @@ from gridreg.fields import import_modules, make_field
 from gridreg.rendering import Ensemble, JoinedSurroundings, Model, OccupancyGrid, Surroundings
 from gridreg.scenes import IN_PLACE, World
 from gridreg.scenes.gate import check_extent
+from gridreg.scenes.notebook import card
 from gridreg.scenes.views import background_colour
 from gridreg.training.checkpoint import has_checkpoint, load_checkpoint, sound
 from gridreg.training.config import from_data
@@ -29,7 +30,7 @@ from gridreg.training.trainer import load_field
 __all__ = ["LoadedRun", "checkpoint_of", "ensemble_of", "load_run", "members_in"]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class LoadedRun(Model):
     """A trained field, in eval mode, with all it takes to render it, and the run that it comes from.
 
@@ -51,6 +52,15 @@ class LoadedRun(Model):
     world: World = IN_PLACE
     exposed: bool = False
     members: tuple[LoadedRun, ...] = ()
+
+    def __repr__(self) -> str:
+        config, of = self.config, f", {len(self.members)} members" if self.members else ""
+        name = f"{config.preset or 'run'}, {type(self.field).__name__}"
+        return f"LoadedRun({name}, step {self.step} of {config.train.steps}, seed {config.seed}{of})"
+
+    def _repr_html_(self) -> str:
+        """The run as notebooks show it, with the table of its regularizers."""
+        return card(repr(self), "") + ("" if self.handle is None else self.handle._repr_html_())
 
 
 def checkpoint_of(folder: str | Path) -> Path:

@@ -73,6 +73,8 @@ class TrainOptions:
     """Write turntable.mp4 (a forward-facing scene: spiral.mp4)."""
     view: bool = False
     """Show the field in the browser while it is trained (extra `viewer`)."""
+    tensorboard: bool = False
+    """Write the figures for TensorBoard as well, into tensorboard/ (extra `tensorboard`)."""
     host: str = "127.0.0.1"
     """Address that the viewer listens on; the default is reached from this machine only."""
     port: int = 8080

@@ -41,6 +41,7 @@ class Progress:
         stream: where to write; standard error by default, because standard output may be data.
         seconds: between two lines of a log; a terminal is refreshed every 0.2 s.
         clock: seconds; stands still while kernels are compiled.
+        notebook: show a bar of tqdm's instead; by default in a notebook.
 
     Example:
         >>> with Progress(3, stream=sys.stdout, seconds=0, clock=iter([0.0, 2.0, 4.0]).__next__) as progress:
@@ -59,6 +60,7 @@ class Progress:
         stream: TextIO | None = None,
         seconds: float = 10.0,
         clock: Callable[[], float] = work_clock,
+        notebook: bool | None = None,
     ) -> None:
         self.total = total
         self._label = label
@@ -72,6 +74,12 @@ class Progress:
         self._start = start
         self._sums: dict[str, tuple[float, int]] = {}
         self._line = ""
+        self._bar: Any = None
+        if ("ipykernel" in sys.modules and stream is None) if notebook is None else notebook:
+            from tqdm.auto import tqdm
+
+            self._bar = tqdm(total=total, initial=start, desc=label, file=stream, mininterval=0)
+            self._seconds = _REFRESH
 
     def __enter__(self) -> Progress:
         return self
@@ -91,16 +99,22 @@ class Progress:
         if now - self._shown < self._seconds and step < self.total:
             return
         line = self._describe(step, now)
+        averages = ", ".join(_shown(name, sum_ / count) for name, (sum_, count) in self._sums.items())
         self._shown = now
         self._sums.clear()
-        if self._live:
+        if self._bar is not None:
+            self._bar.set_postfix_str(averages, refresh=False)
+            self._bar.update(step - self._bar.n)
+        elif self._live:
             self._draw(line)
         else:
             self._write(line + "\n")
 
     def message(self, text: str) -> None:
         """A line that stays, above the live one."""
-        if self._live and self._line:
+        if self._bar is not None:
+            self._bar.write(text)
+        elif self._live and self._line:
             self._write(f"\r\x1b[K{text}\n")
             self._draw(self._line)
         else:
@@ -108,6 +122,8 @@ class Progress:
 
     def close(self) -> None:
         """Leave the live line as it is and go on below it."""
+        if self._bar is not None:
+            self._bar.close()
         if self._live and self._line:
             self._write("\n")
             self._line = ""
