@@ -202,7 +202,7 @@ def test_search_works_from_disk(tmp_path: Path) -> None:
         assert tab.evaluate("document.documentElement.scrollWidth <= innerWidth")
         # A line of code of 100 characters is not cut.
         tab.open(f"file://{site / 'own-field.html'}")
-        widths = "[...document.querySelectorAll('pre > code')].map(c => c.scrollWidth - c.clientWidth)"
+        widths = "[...document.querySelectorAll('.language-python pre > code')].map(c => c.scrollWidth - c.clientWidth)"
         assert max(tab.evaluate(widths)) <= 0
         assert not tab.problems
 
