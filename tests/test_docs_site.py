@@ -202,7 +202,8 @@ def test_search_works_from_disk(tmp_path: Path) -> None:
         assert tab.evaluate("document.documentElement.scrollWidth <= innerWidth")
         # A line of code of 100 characters is not cut.
         tab.open(f"file://{site / 'own-field.html'}")
-        widths = "[...document.querySelectorAll('.language-python pre > code')].map(c => c.scrollWidth - c.clientWidth)"
+        code = "[...document.querySelectorAll('pre > code')].filter(c => c.querySelector('.k, .kn'))"
+        widths = f"{code}.map(c => c.scrollWidth - c.clientWidth)"
         assert max(tab.evaluate(widths)) <= 0
         assert not tab.problems
 
