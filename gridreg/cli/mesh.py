@@ -81,6 +81,7 @@ def run(options: MeshOptions) -> int:
     closed = "watertight" if mesh.watertight else "not watertight"
     print(
         f"{target}: {len(mesh.vertices)} vertices, {len(mesh.faces)} faces, {closed}, "
-        f"volume {mesh.volume:.4g} cubic world units, cut at density {mesh.threshold:.4g} per world unit; size {mesh.size}"
+        f"volume {mesh.volume:.4g} cubic world units, cut at density {mesh.threshold:.4g} per world unit; "
+        f"size {mesh.size}"
     )
     return 0
