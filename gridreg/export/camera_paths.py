@@ -95,7 +95,7 @@ def _changed(orbit: Orbit, elevation: float | None, radius: float | None) -> Orb
             raise InputError(f"elevation={elevation}: expected degrees between -90 and 90")
         orbit = replace(orbit, elevation=elevation)
     if radius is not None:
-        if not 0 < radius < math.inf:
+        if not 0 < radius < 1e18:
             raise InputError(f"radius={radius}: expected a distance in world units above 0")
         orbit = replace(orbit, radius=radius)
     return orbit

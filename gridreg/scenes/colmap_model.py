@@ -5,6 +5,7 @@ Source: COLMAP documentation, "Output Format".
 
 from __future__ import annotations
 
+import io
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -75,7 +76,10 @@ def read_model(folder: Path) -> ColmapModel:
         current = images_file
         images = list((_binary_images if binary else _text_images)(images_file))
         current = points_file
-        points = list((_binary_points if binary else _text_points)(points_file))
+        points = np.fromiter(
+            (value for point in (_binary_points if binary else _text_points)(points_file) for value in point),
+            dtype=np.float64,
+        )
     except (ValueError, IndexError, struct.error, OverflowError) as error:
         if isinstance(error, InputError):
             raise
@@ -87,7 +91,7 @@ def read_model(folder: Path) -> ColmapModel:
             raise InputError(
                 f"{images_file}: image {image.name!r} has camera {image.camera_id}, not in {cameras_file}"
             )
-    placed = np.array(points, dtype=np.float64).reshape(-1, 3)
+    placed = points.reshape(-1, 3)
     if not (np.abs(placed) < 1e18).all():
         raise InputError(f"{points_file}: holds a point that is not finite, or too large for float32")
     ordered = tuple(sorted(images, key=lambda image: image.name))
@@ -111,7 +115,9 @@ def _camera(model: str, width: int, height: int, values: list[float], path: Path
 
 def _lines(path: Path) -> Iterator[str]:
     """Yield every line that is no comment, also empty ones: they matter in ``images.txt``."""
-    yield from (line for line in read_text(path).splitlines() if not line.startswith("#"))
+    # A list of all lines takes several times the memory of the text.
+    text = io.StringIO(read_text(path), newline=None)
+    yield from (line.rstrip("\n") for line in text if not line.startswith("#"))
 
 
 def _text_cameras(path: Path) -> Iterator[tuple[int, ColmapCamera]]:

@@ -232,12 +232,7 @@ def _doubts(world: World, train: Views, test: Views) -> list[str]:
             f"the world is centred on ({place}) and scaled: its unit is now {world.unit:.4g} of the files'"
         )
     for what, views in (("training", train), ("test", test)):
-        seen = views.rgba[..., :3] * views.rgba[..., 3:]
-        pixels = torch.cat([seen, views.rgba[..., 3:]], dim=-1).flatten(1, 2)
-        alike = (
-            (pixels.amax(dim=1) - pixels.amin(dim=1)).amax(dim=-1) < 1 / 255 if len(views) else torch.empty(0)
-        )
-        names = [name for name, same in zip(views.names, alike.tolist(), strict=True) if same]
+        names = views.plain
         if names:
             notes.append(
                 f"{len(names)} of {len(views)} {what} images show nothing but one colour ({names[0]}, ...): "

@@ -181,6 +181,18 @@ class Views:
         off = (self._frame - self.backdrop).abs().amax(dim=-1)
         return silhouettes(self.rgba[..., :3], self.backdrop, off[off < _CLOSE])
 
+    @property
+    def plain(self) -> list[str]:
+        """Names of the images that show nothing but one colour."""
+        found = []
+        # One image after the other: copies of all of them would take as much memory as they do.
+        for name, rgba in zip(self.names, self.rgba, strict=True):
+            alpha = rgba[..., 3:]
+            pixels = torch.cat([rgba[..., :3] * alpha, alpha], dim=-1).flatten(0, 1)
+            if bool((pixels.amax(dim=0) - pixels.amin(dim=0)).amax() < 1 / 255):
+                found.append(name)
+        return found
+
     def composited(self, background: str | Sequence[float] | Tensor) -> Tensor:
         """Return the images over one background colour.
 
@@ -191,8 +203,10 @@ class Views:
             ``(V, H, W, 3)`` float32: ``alpha * rgb + (1 - alpha) * background``.
         """
         colour = background_colour(background).to(self.rgba.device)
-        alpha = self.rgba[..., 3:]
-        return self.rgba[..., :3] * alpha + colour * (1 - alpha)
+        composited = self.rgba.new_empty((*self.rgba.shape[:3], 3))
+        for rgba, target in zip(self.rgba, composited, strict=True):
+            target.copy_(rgba[..., :3] * rgba[..., 3:] + colour * (1 - rgba[..., 3:]))
+        return composited
 
     def to(self, device: torch.device | str) -> Views:
         """Return the same views with their tensors on ``device``."""
