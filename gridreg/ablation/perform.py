@@ -17,6 +17,7 @@ from typing import Any
 
 from gridreg.ablation.claims import ClaimLostError
 from gridreg.ablation.database import DiskFullError
+from gridreg.ablation.own_command import run_command
 from gridreg.ablation.records import RunSpec
 from gridreg.ablation.study import DATA_VARIABLE
 from gridreg.errors import InputError
@@ -156,6 +157,8 @@ def perform(
     """
     try:
         with _printing_to(folder) if log else contextlib.nullcontext():
+            if spec.command:
+                return TaskResult(run_command(spec, folder, watch), machine=describe_machine())
             scene, path = scenes.get(spec), spec.scene
             if path is not None:
                 # A scene that was shipped lies nowhere here.

@@ -40,6 +40,7 @@ class RunSpec:
         config: the whole `gridreg.training.RunConfig` as plain data, the composition spelled out.
         size: width of the images in pixels, instead of the protocol's.
         test: indices into the test frames, instead of the protocol's.
+        command: words of a program that does the run, see `gridreg.ablation.own_command`; none: gridreg does.
 
     Example:
         >>> spec = RunSpec("none", None, "builtin8", 8, 0, "quick", "vm", {"composition": [], "seed": 0})
@@ -57,6 +58,7 @@ class RunSpec:
     config: dict[str, Any] = field(hash=False)
     size: int | None = None
     test: tuple[int, ...] | None = None
+    command: tuple[str, ...] = ()
 
     @property
     def scene_name(self) -> str:
@@ -91,6 +93,8 @@ class RunSpec:
             "test": None if self.test is None else list(self.test),
             "config": config,
         }
+        if self.command:
+            content["command"] = list(self.command)
         text = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=True)
         return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()[:16]
 

@@ -29,6 +29,7 @@ from pathlib import Path
 import torch
 
 import gridreg
+from gridreg.ablation.own_command import words_of
 from gridreg.ablation.records import RunSpec, Study
 from gridreg.ablation.rows import Row, expand_rows
 from gridreg.ablation.study_file import StudyFile
@@ -125,7 +126,8 @@ def _runs(file: StudyFile, rows: Sequence[Row], scenes: Sequence[Path | None]) -
                         ("compositions",), f"two rows are called {label!r}; give one another label"
                     )
                 fit = str((config.backbone, config.field, config.composition))
-                if fit not in fitting:
+                # A program of somebody's has a field of its own.
+                if fit not in fitting and file.command is None:
                     fitting.add(fit)
                     check_fits(label, config)
                 runs += _row_runs(file, label, config, scenes)
@@ -154,6 +156,7 @@ def _row_runs(file: StudyFile, label: str, config: RunConfig, scenes: Sequence[P
                         config=to_data(full),
                         size=file.size,
                         test=None if file.test is None else tuple(file.test),
+                        command=() if file.command is None else words_of(file.command),
                     )
                 )
     return runs

@@ -32,6 +32,7 @@ class StudyFile:
         set: values of the configuration by dotted key, for every run.
         size: width of the images in pixels instead of the protocol's.
         test: indices into the test frames instead of the protocol's.
+        command: a program that does each run, instead of gridreg: words with ``{seed}`` and the like in them.
         modules: Python modules that register regularizers, compositions or fields of one's own.
     """
 
@@ -50,6 +51,7 @@ class StudyFile:
     set: dict[str, Any] = dataclasses.field(default_factory=dict)
     size: int | None = None
     test: list[int] | None = None
+    command: str | None = None
     modules: list[str] = dataclasses.field(default_factory=list)
 
     def __post_init__(self) -> None:
