@@ -224,3 +224,27 @@ def test_paths_are_compared_at_equal_steps_and_seeds(tables: ModuleType, tmp_pat
     # Without a partner of as many steps.
     store(tmp_path, "quick", "lego", 0, 27.0, steps=1200)
     assert tables.Results(tmp_path).beside_plain() == "0.00 [−6.35, +6.35] dB (2 pairs)"
+
+
+def test_gains_on_fields_of_others_are_paired_by_seed_and_image(tables: ModuleType, tmp_path: Path) -> None:
+    foreign = sys.modules["results_foreign"]
+    for seed, gain in enumerate((1.0, 2.0, 3.0)):
+        record = {
+            "scene": "lego",
+            "field": "kplanes",
+            "composition": "background+smooth:0.01",
+            "split": "test",
+            "seed": seed,
+            "psnr": {"bare": [20.0, 22.0], "attached": [20.0 + 2 * gain, 22.0]},
+            "step_seconds": {"bare": 0.1, "attached": 0.1 + 0.001 * seed},
+        }
+        stored.save("foreign", f"seed{seed}", record, tmp_path)
+    stored.save("foreign", "cost", {"field": "kplanes", "split": "cost", "percent": 0.44}, tmp_path)
+    rows = foreign.foreign(tmp_path).splitlines()[2:]
+    words = "`ExpectedBackground` α, `TotalVariation` 0.01"
+    # 2.484 is Student's t of two degrees of freedom at 97.5 %, by the root of three.
+    assert rows == [
+        f"| K-Planes | {words} | lego | 21.00 | +2.00 [−0.48, +4.48] (3 seeds) | 3 of 6 | +1 % |  |",
+        "| **K-Planes** |  | together |  | +2.00 [−0.48, +4.48] (3 pairs) |  |  | +0.4 % |",
+    ]
+    assert "+2.00 [−0.48, +4.48] on K-Planes" in foreign.sentence(tmp_path)
