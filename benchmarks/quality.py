@@ -2,8 +2,9 @@
 
     python benchmarks/quality.py --data DIR --scenes lego chair --runs quick quick:tensorf quick:few_tensorf --seeds 0
 
-A run is PRESET or PRESET:COMPOSITION. Results that are stored already are not computed again. The table is printed
-from the stored ones: `python benchmarks/quality.py --table`.
+A run is PRESET or PRESET:COMPOSITION; with --opaque it sees nothing of the alpha, and is called RUN-opaque. Results
+that are stored already are not computed again. The table is printed from the stored ones: `python
+benchmarks/quality.py --table`.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import argparse
 import tempfile
 from collections.abc import Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 
 import stored
@@ -21,6 +23,7 @@ from timing.whole_run import Spans
 
 from gridreg.cli import run_cli
 from gridreg.ops import use_backend
+from gridreg.scenes import Scene, Views
 from gridreg.training import StepReport, configure, execute, open_scene
 from gridreg.training.checkpoint import has_checkpoint
 from gridreg.training.options import TrainOptions
@@ -59,10 +62,22 @@ def record_name(
     return f"{scene}-{protocol}-{run.replace(':', '+')}{other}{length}-seed{seed}"
 
 
+def on_paper(scene: Scene) -> Scene:
+    """Return the scene as opaque images on its background: nothing of the alpha is left."""
+
+    def flat(views: Views) -> Views:
+        rgb = views.composited(scene.background)
+        return replace(views, rgba=torch.cat([rgb, torch.ones_like(rgb[..., :1])], dim=-1))
+
+    validation = None if scene.validation is None else flat(scene.validation)
+    return replace(scene, train=flat(scene.train), test=flat(scene.test), validation=validation)
+
+
 def score(folder: Path, run: str, seed: int, arguments: argparse.Namespace) -> None:
     """Train and score one run, and store it, unless it is stored already."""
     steps, protocol, changes = arguments.steps, arguments.protocol, tuple(arguments.set)
     shown = run if arguments.backend == "auto" else f"{run}-{arguments.backend}"
+    shown += "-opaque" if arguments.opaque else ""
     name = record_name(folder.name, shown, seed, steps, protocol, changes)
     if stored.find(STUDY, name, arguments.results):
         return
@@ -78,6 +93,7 @@ def score(folder: Path, run: str, seed: int, arguments: argparse.Namespace) -> N
     )
     config = configure(options)
     scene = open_scene(config, cache=stored.SCENES)
+    scene = on_paper(scene) if arguments.opaque else scene
     spans = Trained(config.train)
     use_backend(arguments.backend)
     with ExitStack() as stack:
@@ -91,9 +107,15 @@ def score(folder: Path, run: str, seed: int, arguments: argparse.Namespace) -> N
     command += [] if protocol == PROTOCOL else ["--protocol", protocol]
     command += [] if steps is None else ["--steps", str(steps)]
     command += [] if arguments.backend == "auto" else ["--backend", arguments.backend]
+    command += ["--opaque"] if arguments.opaque else []
     command += ["--set", *changes] if changes else []
     # Peak memory among the spans is that of the process, which may have done other runs before.
-    metrics |= {"spans": spans.rows, "run": run, "command": command, "changes": list(changes)}
+    metrics |= {
+        "spans": spans.rows,
+        "run": shown if arguments.opaque else run,
+        "command": command,
+        "changes": list(changes),
+    }
     metrics["config"] = {**metrics["config"], "scene": folder.name}
     stored.save(STUDY, name, metrics, arguments.results)
     print(row(metrics), flush=True)
@@ -129,6 +151,9 @@ def main(words: Sequence[str] | None = None) -> int:
     )
     parser.add_argument(
         "--resume", action="store_true", help="go on with stopped runs, where --keep has their folder"
+    )
+    parser.add_argument(
+        "--opaque", action="store_true", help="without alpha: the images on the protocol's background"
     )
     parser.add_argument("--results", type=Path, default=stored.RESULTS, help="folder of the stored figures")
     parser.add_argument("--table", action="store_true", help="print what is stored, and end")

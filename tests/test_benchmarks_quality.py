@@ -75,3 +75,13 @@ def test_resume_needs_a_place(program: ModuleType, place: Path, capsys: pytest.C
         program.main(["--data", str(place.parent), "--scenes", place.name, "--resume"])
     assert ended.value.code == 2
     assert "--keep" in capsys.readouterr().err
+
+
+def test_opaque_runs_see_no_alpha_and_are_called_so(program: ModuleType, place: Path, tmp_path: Path) -> None:
+    (record,) = run(program, place, tmp_path / "kept", tmp_path / "results", "--opaque")
+    assert record["run"] == "quick-opaque"
+    assert record["uses_alpha"] is False
+    assert "--opaque" in record["command"]
+    scene = program.on_paper(program.open_scene(program.configure(program.TrainOptions(scene=place)), place))
+    assert bool((scene.train.rgba[..., 3] == 1).all())
+    assert scene.train.backdrop is not None
