@@ -42,6 +42,16 @@ class Beside:
         """The surroundings, to be rendered."""
         return None if self.surroundings is None else self.surroundings.model
 
+    def note(self, scene: Scene, carves: bool) -> str:
+        """A line on what is taken for the background of opaque photographs, or nothing."""
+        if self.surroundings is not None:
+            return "opaque photographs: what is outside the box is learned, too, instead of a background"
+        if scene.train.backdrop is None:
+            return ""
+        colour = ", ".join(f"{c:.2f}" for c in scene.background.tolist())
+        rest = ", and tells their silhouettes" if carves else ", never a random one"
+        return f"opaque photographs on one colour ({colour}): it is the background{rest}"
+
     def finish(self, rendered: Rendered, batch: Batch, bank: RayBank, generator: torch.Generator) -> Rendered:
         """Pixels with what is behind the box, as the photographs show them.
 

@@ -102,12 +102,9 @@ class Execution:
         trainer, settings = self.trainer, self.config.train
         began = saved = work_clock()
         before = self.seconds.get("train", 0.0)
-        if self.scene.train.backdrop is not None:
-            colour = ", ".join(f"{c:.2f}" for c in self.scene.background.tolist())
-            progress.message(
-                f"opaque photographs on one colour ({colour}): it is the background"
-                + (", and tells their silhouettes" if self.trainer.space.carves else ", never a random one")
-            )
+        note = trainer.beside.note(self.scene, trainer.space.carves)
+        if note:
+            progress.message(note)
 
         def each(report: StepReport) -> bool:
             nonlocal saved

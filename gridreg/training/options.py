@@ -44,7 +44,7 @@ class TrainOptions:
     """Take images without alpha as opaque, also beside others that have it."""
     preset: str = "quick"
     """Field, schedule and regularizers by name: quick, best, best-long, human, tensorf, few_tensorf, few_tensorf_10k,
-    few_tensorf_finetuned, cp, cp_quick, freenerf, freenerf_quick, fourierf, sanerf; `paper` is few_tensorf;
+    few_tensorf_finetuned, cp, cp_quick, freenerf, freenerf_quick, fourierf, sanerf, few; `paper` is few_tensorf;
     `gridreg show presets` says what each is."""
     composition: _Name = None
     """Another composition of regularizers on the field and schedule: none, tensorf, few_tensorf, few_tensorf_printed,
