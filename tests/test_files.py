@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from gridreg.errors import InputError
+from gridreg.scenes import builtin_scene
 from gridreg.training import files
 
 
@@ -250,3 +251,22 @@ def test_one_writer_keeps_others_out_and_dies_with_its_process(tmp_path):
     killed = run("with files.one_writer(sys.argv[1]): os.kill(os.getpid(), signal.SIGKILL)", tmp_path)
     assert killed.returncode == -9
     assert run("with files.one_writer(sys.argv[1]): print('in')", tmp_path).stdout == "in\n"
+
+
+def test_what_a_process_left_that_died_right_after_the_builtin_scene(tmp_path):
+    done = run(
+        """
+        from gridreg.scenes import builtin_scene
+        rename = Path.rename
+        def dying(path, target):
+            rename(path, target)
+            os.kill(os.getpid(), signal.SIGKILL)
+        Path.rename = dying
+        builtin_scene(Path(sys.argv[1]), size=8)
+        """,
+        tmp_path,
+    )
+    assert done.returncode == -9
+    assert len(list(tmp_path.iterdir())) == 2
+    assert builtin_scene(tmp_path, size=8).parent == tmp_path
+    assert [path.name for path in tmp_path.iterdir()] == ["lighthouse_8"]

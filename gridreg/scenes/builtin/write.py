@@ -7,6 +7,7 @@ import os
 import shutil
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -69,6 +70,9 @@ def write_once(
     Raises:
         InputError: when the folder cannot be written, or something else is in its place.
     """
+    # Also where the scene is complete: a process may have died right after it.
+    with suppress(OSError):
+        remove_left_behind(target.parent)
     if _is_complete(target, marker, needed):
         return target
     if target.exists() and not (target / BUILTIN_MARKER).is_file():
@@ -78,7 +82,6 @@ def write_once(
     scratch = temporary_beside(target)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        remove_left_behind(target.parent)
         scratch.mkdir()
         fresh = scratch / "scene"
         write(fresh)
