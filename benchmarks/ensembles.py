@@ -5,6 +5,10 @@
 
 Joins the first two seeds, then three, and so on, and stores them in benchmarks/results/ensembles.jsonl. What is stored
 already is not computed again. `docs/make_results.py` makes a table of it.
+
+With `--deviation`, whether the deviation of all seeds' renders tells where they are wrong, on the test views: the rank
+correlation (Spearman) of deviation and true error over the pixels of each view's object (chance: 0), over all pixels,
+and over whole views; stored in benchmarks/results/deviations.jsonl.
 """
 
 from __future__ import annotations
@@ -18,18 +22,21 @@ from pathlib import Path
 import stored
 import torch
 from error_images import kept_run
+from scipy.stats import spearmanr
 from stored import Record
 
 from gridreg.cli import run_cli
 from gridreg.errors import InputError
+from gridreg.rendering import Camera, Lens
 from gridreg.scenes import Scene, load_scene
 from gridreg.training import LoadedRun, load_run
 from gridreg.training.config import to_data
 from gridreg.training.evaluate import score_views
 from gridreg.training.loading import ensemble_of
 from gridreg.training.record import metrics_record
+from gridreg.training.versions import versions
 
-STUDY = "ensembles"
+STUDY, DEVIATIONS = "ensembles", "deviations"
 
 
 def score(folder: Path, run: str, arguments: argparse.Namespace) -> None:
@@ -98,6 +105,60 @@ def joined_record(
     )
 
 
+def deviation_record(joined: LoadedRun, scene: Scene) -> Record:
+    """Return the rank correlations of the members' deviation with the true error of their mean."""
+    views, pixels, everywhere, means = scene.test, {}, {}, []
+    targets = views.composited(joined.background)
+    for i, (pose, intrinsics, name) in enumerate(
+        zip(views.poses, views.intrinsics, views.names, strict=True)
+    ):
+        camera = Camera(pose, Lens.from_tensor(intrinsics, views.height, views.width))
+        rendered = joined.render(camera, deviation=True)
+        assert rendered is not None
+        assert rendered.deviation is not None
+        error, deviation = (rendered.colour - targets[i]).square().mean(-1).sqrt(), rendered.deviation
+        seen = (rendered.opacity > 0.5) | (views.rgba[i, ..., 3] > 0.5)
+        pixels[name] = float(spearmanr(deviation[seen], error[seen])[0])
+        everywhere[name] = float(spearmanr(deviation.flatten(), error.flatten())[0])
+        means.append([float(value.square().mean()) for value in (deviation, error)])
+    return {
+        "members": len(joined.members),
+        "object_pixels": pixels,
+        "all_pixels": everywhere,
+        "views": float(spearmanr(*zip(*means, strict=True))[0]),
+    }
+
+
+def store_deviation(folder: Path, run: str, arguments: argparse.Namespace) -> None:
+    """Store whether the deviation of all seeds together tells where they are wrong."""
+    seeds, protocol = arguments.seeds, arguments.protocol
+    name = f"{folder.name}-{protocol}-{run.replace(':', '+')}-seeds{','.join(map(str, seeds))}"
+    if stored.find(DEVIATIONS, name, arguments.results):
+        return
+    scene = load_scene(folder, protocol)
+    places = [kept_run(arguments.kept, folder.name, run, seed, protocol) for seed in seeds]
+    joined = ensemble_of([load_run(place) for place in places])
+    if joined.fingerprint != scene.fingerprint:
+        raise InputError(f"{places[0]}: trained on other images than those of {folder} under {protocol}")
+    record = {
+        "scene": scene.name,
+        "builtin": scene.builtin,
+        "protocol": protocol,
+        "run": run,
+        "seeds": list(seeds),
+        **deviation_record(joined, scene),
+        "command": stored.command_line("benchmarks/ensembles.py"),
+        "versions": versions(),
+    }
+    stored.save(DEVIATIONS, name, record, arguments.results)
+    found = list(record["object_pixels"].values())
+    print(
+        f"{folder.name} {run}: rank correlation of deviation and error {sum(found) / len(found):.2f} over pixels "
+        f"of the object (least {min(found):.2f} of {len(found)} views), {record['views']:.2f} over views",
+        flush=True,
+    )
+
+
 def main(words: Sequence[str] | None = None) -> int:
     """Parse the command line and score."""
     parser = argparse.ArgumentParser(
@@ -109,6 +170,9 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--runs", nargs="+", default=["best"])
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--protocol", default="dietnerf8")
+    parser.add_argument(
+        "--deviation", action="store_true", help="whether deviation tells where they are wrong"
+    )
     parser.add_argument("--threads", type=int)
     parser.add_argument("--results", type=Path, default=stored.RESULTS, help="folder of the stored figures")
     arguments = parser.parse_args(words)
@@ -118,7 +182,10 @@ def main(words: Sequence[str] | None = None) -> int:
         torch.set_num_threads(arguments.threads)
     for scene in arguments.scenes:
         for run in arguments.runs:
-            score(arguments.data / scene, run, arguments)
+            if arguments.deviation:
+                store_deviation(arguments.data / scene, run, arguments)
+            else:
+                score(arguments.data / scene, run, arguments)
     return 0
 
 

@@ -210,6 +210,17 @@ class Results:
             ["runs", "seeds alone (dB)", "joined (dB)", "gain over their mean (dB)", "SSIM 11x11"], rows
         )
 
+    def deviations(self) -> str:
+        """Return whether the deviation of several seeds tells where they are wrong."""
+        rows = []
+        for one in load("deviations", self.folder):
+            found = sorted(one["object_pixels"].values())
+            span = f"{statistics.fmean(found):.2f} ({found[0]:.2f} to {found[-1]:.2f})"
+            rows.append(
+                [f"`{one['run']}`, {one['scene']}, {one['members']} seeds", span, f"{one['views']:.2f}"]
+            )
+        return table(["runs", "pixels of the object, mean (range) over views", "views"], rows)
+
     def beside_plain(self) -> str:
         """Return the mean difference (dB) of the compiled path to the plain one, of runs that have both."""
         found: dict[tuple[Any, ...], dict[bool, float]] = {}

@@ -6,11 +6,14 @@ import json
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
 import pytest
 
 from gridreg.errors import InputError
+from gridreg.rendering import Camera, Lens
 from gridreg.scenes import builtin_scene, load_scene
-from gridreg.training import RunConfig, TrainSettings, execute
+from gridreg.training import RunConfig, TrainSettings, execute, load_run
+from gridreg.training.loading import ensemble_of
 from tests.programs import ROOT, module_at
 
 FIELD = {"density_components": 4, "appearance_components": 4, "decoder": "sh"}
@@ -98,3 +101,32 @@ def test_runs_that_are_missing_and_one_seed(
         program.main(words(kept, tmp_path, "--seeds", "0", "7"))
     with pytest.raises(InputError, match="--seeds: found 1, expected at least two"):
         program.main(words(kept, tmp_path, "--seeds", "0"))
+
+
+def test_whether_deviation_tells_where_they_are_wrong(
+    program: ModuleType, kept: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert program.main(words(kept, tmp_path, "--deviation")) == 0
+    (record,) = map(json.loads, (tmp_path / "deviations.jsonl").read_text().splitlines())
+    assert record["members"] == 3
+    assert len(record["object_pixels"]) == len(record["all_pixels"]) == 25
+    assert all(-1 <= value <= 1 for value in [*record["object_pixels"].values(), record["views"]])
+    # By hand, for one view: ranks, and their linear correlation.
+    joined = ensemble_of(
+        [load_run(kept[1] / f"{kept[0].name}-builtin8-small-seed{seed}") for seed in range(3)]
+    )
+    views = load_scene(kept[0], "builtin8").test
+    rendered = joined.render(
+        Camera(views.poses[0], Lens.from_tensor(views.intrinsics[0], views.height, views.width)),
+        deviation=True,
+    )
+    error = (rendered.colour - views.composited(joined.background)[0]).square().mean(-1).sqrt()
+    ranks = [
+        np.unique(x.flatten().numpy(), return_inverse=True, return_counts=True)
+        for x in (rendered.deviation, error)
+    ]
+    means = [(np.cumsum(counts) - (counts - 1) / 2)[inverse] for _, inverse, counts in ranks]
+    assert record["all_pixels"][views.names[0]] == pytest.approx(np.corrcoef(*means)[0, 1], abs=1e-6)
+    assert "rank correlation of deviation and error" in capsys.readouterr().out
+    assert program.main(words(kept, tmp_path, "--deviation")) == 0
+    assert capsys.readouterr().out == ""

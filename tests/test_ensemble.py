@@ -13,8 +13,21 @@ from torch import Tensor, nn
 
 from gridreg.cli import main
 from gridreg.errors import InputError
+from gridreg.export import MODES, next_view, to_image
+from gridreg.export.images import MAX_DEVIATION
+from gridreg.export.next_view import NextView
 from gridreg.export.preview import Preview
-from gridreg.rendering import Ensemble, MarchSettings, OccupancyGrid, Rays, render_rays
+from gridreg.rendering import (
+    Camera,
+    Ensemble,
+    Lens,
+    MarchSettings,
+    OccupancyGrid,
+    Rays,
+    Rendered,
+    render_rays,
+)
+from gridreg.rendering.model import Model
 from gridreg.scenes import builtin_scene, load_scene
 from gridreg.training import RunConfig, TrainSettings, execute, load_run, save_ensemble
 
@@ -209,3 +222,107 @@ def test_the_command_and_those_that_read_what_it_wrote(desk, tmp_path, monkeypat
     text = capsys.readouterr().err
     assert text.startswith("error: c: trained on another scene than a")
     assert len(text.splitlines()) == 1
+
+
+# --- where members differ
+
+
+@pytest.fixture(scope="module")
+def both(desk: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The ensemble of `a` and `b`."""
+    folder = tmp_path_factory.mktemp("both")
+    save_ensemble([desk / "a", desk / "b"], folder)
+    return folder
+
+
+def test_deviation_is_that_of_the_members_images(both):
+    run = load_run(both)
+    scene = load_scene(Path(run.config.scene or ""), "builtin8")
+    camera = Camera(scene.train.poses[0], Lens.from_tensor(scene.train.intrinsics[0], 32, 32))
+    found = run.render(camera, deviation=True)
+    one, other = (member.render(camera).colour.double().numpy() for member in run.members)
+    # Two numbers: their standard deviation (n - 1) is the distance over the root of 2.
+    expected = np.sqrt((((one - other) ** 2) / 2).mean(axis=-1))
+    np.testing.assert_allclose(found.deviation.numpy(), expected, atol=1e-6)
+    assert expected.max() > 0.01
+    plain = run.render(camera)
+    assert plain.deviation is None
+    assert torch.equal(plain.colour, found.colour)
+    assert run.render(camera, deviation=True, stop=lambda: True) is None
+    with pytest.raises(InputError, match="deviation: found one run, expected an ensemble"):
+        run.members[0].render(camera, deviation=True)
+
+
+def test_an_image_of_the_deviation(both):
+    values = torch.tensor([[0.0, MAX_DEVIATION]])
+    image = to_image(
+        Rendered(torch.zeros(1, 2, 3), torch.ones(1, 2), torch.ones(1, 2), deviation=values), "deviation"
+    )
+    assert image[0, 0].max() < 10
+    assert image[0, 1].min() > 150
+    with pytest.raises(InputError, match="found a render without it"):
+        to_image(Rendered(torch.zeros(1, 2, 3), torch.ones(1, 2), torch.ones(1, 2)), "deviation")
+    run = load_run(both)
+    assert Preview(run).modes == MODES
+    assert Preview(run.members[0]).modes == ("rgb", "depth", "opacity")
+
+
+class Lopsided(Model):
+    """Members differ when looked at from a direction, and the less the further away."""
+
+    place = torch.tensor([0.6, -0.8, 0.0])
+
+    def render(self, camera, *, deviation=False, **_):
+        direction = camera.pose[:3, 3] / camera.pose[:3, 3].norm()
+        value = torch.full((4, 4), float((direction @ self.place).clamp(min=0)))
+        return Rendered(torch.zeros(4, 4, 3), value, value, deviation=value)
+
+
+def test_next_photograph_is_where_members_differ_most(desk):
+    scene = load_scene(Path(load_run(desk / "a").config.scene or ""), "builtin8")
+    field = Flat(1.0, (0.0, 0.0, 0.0))
+    found = next_view(Lopsided(field, full(), MarchSettings(0.1)), scene.train, candidates=200)
+    direction = found.camera.pose[:3, 3] / found.camera.pose[:3, 3].norm()
+    assert float(direction @ Lopsided.place) > 0.97
+    assert found.deviation > found.usual
+    assert found.elevation == pytest.approx(float(torch.asin(direction[2]).rad2deg()), abs=2)
+    # Turning the nearest photograph's camera around z by the angle leads there.
+    places = dict(zip(scene.train.names, scene.train.poses[:, :3, 3].numpy(), strict=True))
+    cosines = {name: p @ direction.numpy() / np.linalg.norm(p) for name, p in places.items()}
+    assert found.nearest == max(cosines, key=cosines.get)
+    start = np.arctan2(places[found.nearest][1], places[found.nearest][0])
+    end = np.arctan2(float(direction[1]), float(direction[0]))
+    assert np.cos(end - start - np.radians(found.turn)) == pytest.approx(1.0, abs=2e-3)
+    text = str(NextView(found.camera, 31.4, "r_3", -40.2, 0.05, 0.02))
+    assert text.startswith(
+        "photograph here next: 40 degrees to the left of r_3, 31 degrees above the horizon"
+    )
+    with pytest.raises(InputError, match="and two candidates"):
+        next_view(Lopsided(field, full(), MarchSettings(0.1)), scene.train, candidates=1)
+
+
+def test_the_commands_show_where_not_to_trust_it(desk, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(desk)
+    out = tmp_path / "joined"
+    assert main(["ensemble", "a", "b", "--out", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert "photograph here next: " in said
+    about = json.loads((out / "next.json").read_text())["about"]
+    assert about in said
+    # The file is a path of cameras.
+    words = ["--path", str(out / "next.json"), "--modes", "rgb", "deviation", "--out", f"{out}/video"]
+    assert main(["render", str(out), *words]) == 0
+    assert len(list((out / "video").glob("*.png"))) == 1
+    assert (
+        main(["render", "a", "--frames", "1", "--width", "8", "--modes", "deviation", "--out", f"{out}/no"])
+        == 2
+    )
+    assert "expected an ensemble" in capsys.readouterr().err
+    assert main(["mesh", str(out), "--resolution", "24", "--threshold", "0.5"]) == 0
+    assert main(["page", str(out)]) == 0
+    text = (out / "index.html").read_text()
+    assert "Where not to trust it" in text
+    assert about[1:] in text
+    assert text.count('alt="deviation of the members"') == 4
+    assert main(["page", "a"]) == 0
+    assert "Where not to trust it" not in (desk / "a/index.html").read_text()

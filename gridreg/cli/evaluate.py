@@ -107,7 +107,7 @@ def _score(options: EvalOptions) -> int:
         )
     print(summary(record), flush=True)
     if options.out is not None:
-        write_page(options.out, scene, run=folder_of(options.checkpoint))
+        write_page(options.out, scene, run=folder_of(options.checkpoint), model=loaded)
     return 0
 
 

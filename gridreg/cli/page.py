@@ -37,6 +37,6 @@ def run(options: PageOptions) -> int:
     scene = views_scene(loaded, options.checkpoint, options.scene)
     if scene is None:
         print(f"{loaded.config.scene}: not there any more, so no photographs", file=sys.stderr)
-    path = write_page(folder_of(options.checkpoint), scene)
+    path = write_page(folder_of(options.checkpoint), scene, model=loaded)
     print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
     return 0

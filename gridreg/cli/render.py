@@ -27,8 +27,8 @@ class RenderOptions:
     """Video (.mp4, .gif), or a name without suffix for PNG frames; default: PATH.mp4 in the run's folder."""
     path: OptionalText = None
     """turntable (default), spiral (default facing forward), train (the training cameras), or a JSON file."""
-    modes: tuple[Literal["rgb", "depth", "opacity"], ...] = ("rgb",)
-    """What to show, side by side; depth has a scale in world units."""
+    modes: tuple[Literal["rgb", "depth", "opacity", "deviation"], ...] = ("rgb",)
+    """What to show, side by side; depth has a scale in world units; deviation: how far an ensemble's members differ."""
     frames: int = 120
     """Number of images; a camera file has its own."""
     fps: float = 30.0

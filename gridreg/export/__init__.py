@@ -7,6 +7,7 @@ from gridreg.export.compare import MeshComparison, compare_meshes
 from gridreg.export.images import MODES, to_image
 from gridreg.export.mesh import Mesh, extract_mesh
 from gridreg.export.mesh_files import read_mesh, save_mesh, write_mesh
+from gridreg.export.next_view import NextView, next_view
 from gridreg.export.page import write_page
 from gridreg.export.runs import (
     LiveView,
@@ -29,6 +30,7 @@ __all__ = [
     "Mesh",
     "MeshComparison",
     "Model",
+    "NextView",
     "Orbit",
     "Viewer",
     "camera_path",
@@ -40,6 +42,7 @@ __all__ = [
     "live_view",
     "load_cameras",
     "look_at",
+    "next_view",
     "orbit_of_box",
     "orbit_of_views",
     "to_image",

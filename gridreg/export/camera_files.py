@@ -21,8 +21,16 @@ __all__ = ["load_cameras", "save_cameras"]
 _LENS_KEYS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
 
 
-def save_cameras(path: str | Path, cameras: Sequence[Camera]) -> None:
+def save_cameras(
+    path: str | Path, cameras: Sequence[Camera], world: World = IN_PLACE, *, about: str = ""
+) -> None:
     """Write a camera file, whole or not at all.
+
+    Args:
+        path: the JSON file.
+        cameras: one for each frame.
+        world: where their coordinates lie in the world of the file.
+        about: a note that is written along.
 
     Raises:
         InputError: if the place is not writable or the disk is full.
@@ -32,9 +40,15 @@ def save_cameras(path: str | Path, cameras: Sequence[Camera]) -> None:
         (fx, fy, cx, cy), lens = camera.lens.intrinsics, camera.lens
         values = (fx, fy, cx, cy, lens.width, lens.height)
         frames.append(
-            {**dict(zip(_LENS_KEYS, values, strict=True)), "transform_matrix": camera.pose.tolist()}
+            {**dict(zip(_LENS_KEYS, values, strict=True)), "transform_matrix": _outward(camera, world)}
         )
-    write_json(path, {"frames": frames})
+    write_json(path, {**({"about": about} if about else {}), "frames": frames})
+
+
+def _outward(camera: Camera, world: World) -> list[list[float]]:
+    pose = camera.pose.double().cpu().numpy()
+    pose[:3, 3] = world.outward(pose[:3, 3]) if world != IN_PLACE else pose[:3, 3]
+    return [[float(value) for value in row] for row in pose]
 
 
 @np.errstate(all="ignore")

@@ -22,10 +22,13 @@ from gridreg.training.images import (
 
 __all__ = ["MODES", "DepthRange", "check_mode", "colour_bar", "depth_range", "to_image", "z_depth"]
 
-MODES = ("rgb", "depth", "opacity")
+MODES = ("rgb", "depth", "opacity", "deviation")
 """Quantities of a render that an image can show."""
 
 DepthRange = tuple[float, float]
+
+MAX_DEVIATION = 0.2
+"""Upper end of the scale of deviations; fixed, so that images compare."""
 
 # Depths of rays that hit next to nothing are noise.
 _SEEN = 0.05
@@ -57,7 +60,8 @@ def to_image(rendered: Rendered, mode: str, depths: DepthRange | None = None) ->
     """One mode of a render as an image.
 
     Depth is the mean distance of what a pixel hits, from near (dark blue) to far (dark red), blended into
-    white where little is hit; opacity is grey, white for 1.
+    white where little is hit; opacity is grey, white for 1. The deviation of an ensemble's members goes from black
+    for 0 to light yellow for `MAX_DEVIATION`.
 
     Args:
         rendered: colour ``(H, W, 3)``, opacity and depth ``(H, W)``.
@@ -75,6 +79,10 @@ def to_image(rendered: Rendered, mode: str, depths: DepthRange | None = None) ->
         return to_uint8(rendered.colour)
     if mode == "opacity":
         return to_uint8(rendered.opacity[..., None].expand(*rendered.opacity.shape, 3))
+    if mode == "deviation":
+        if rendered.deviation is None:
+            raise InputError("deviation: found a render without it, expected one of an ensemble")
+        return coloured(rendered.deviation.double().cpu().numpy(), 0.0, MAX_DEVIATION)
     near, far = depth_range([rendered]) if depths is None else depths
     mean = rendered.depth / rendered.opacity.clamp(min=_SEEN)
     colours = coloured(mean.detach().double().cpu().numpy(), near, far, DEPTH_COLOURS)

@@ -15,17 +15,20 @@ import numpy as np
 import torch
 from jinja2 import Environment
 from markupsafe import Markup
-from numpy.typing import NDArray
 from PIL import Image
 
 from gridreg.errors import InputError
 from gridreg.export.cameras import Orbit, orbit_of_box, orbit_of_views
 from gridreg.export.decimation import decimate
-from gridreg.export.html import data_uri, encode, open_image, page_environment, spread_views, target_beside
+from gridreg.export.html import encode, open_image, page_environment, spread_views, target_beside
+from gridreg.export.images import MAX_DEVIATION, to_image
 from gridreg.export.line_chart import Series, line_chart
 from gridreg.export.mesh import Mesh
 from gridreg.export.mesh_files import read_mesh
-from gridreg.scenes import Scene, Views, World
+from gridreg.export.page_object import next_camera, object_data, photographs_of
+from gridreg.rendering.cameras import Camera, Lens
+from gridreg.rendering.model import Model
+from gridreg.scenes import Scene
 from gridreg.training.curves import History
 from gridreg.training.files import write_bytes
 
@@ -37,11 +40,16 @@ FACES = 60_000
 VIDEO_BYTES = 600_000
 """A larger video stays beside the page, which has a link to it."""
 
-_PHOTOGRAPHS, _VIEWS, _THUMBNAIL = 60, 8, 160
-_UINT16 = 2**16 - 1
+_VIEWS, _DOUBT = 8, 240
 
 
-def write_page(folder: str | Path, scene: Scene | None = None, *, run: str | Path | None = None) -> Path:
+def write_page(
+    folder: str | Path,
+    scene: Scene | None = None,
+    *,
+    run: str | Path | None = None,
+    model: Model | None = None,
+) -> Path:
     """Write ``index.html`` into the folder of a run, from what lies there; whole or not at all.
 
     It has the mesh to turn, the training photographs at their cameras, test views beside renders, score, curve and
@@ -51,6 +59,7 @@ def write_page(folder: str | Path, scene: Scene | None = None, *, run: str | Pat
         folder: where it goes to, and what it is made of.
         scene: what the run was trained on, for photographs and cameras.
         run: folder of the run, for what ``folder`` does not have; None: the same.
+        model: of an ensemble, to show where its members differ; None, or that of one run: this is not shown.
 
     Returns:
         The path.
@@ -64,8 +73,9 @@ def write_page(folder: str | Path, scene: Scene | None = None, *, run: str | Pat
     if mesh is not None and scene is not None:
         mesh = replace(mesh, metric=scene.world.metric)
     orbit = _orbit(scene, mesh)
-    photographs = [] if scene is None else _photographs(scene.train, scene.background)
+    photographs = [] if scene is None else photographs_of(scene.train, scene.background)
     score, note = _score(record)
+    beyond = next_camera(_found(places, "next.json"))
     name = record.get("scene") or (scene.name if scene is not None else Path(folder).resolve().name)
     text = (
         _environment()
@@ -73,12 +83,17 @@ def write_page(folder: str | Path, scene: Scene | None = None, *, run: str | Pat
         .render(
             title=name,
             lead=_lead(record, scene),
-            object=None if mesh is None else _object(mesh, scene, orbit, len(photographs)),
+            object=None
+            if mesh is None
+            else object_data(mesh, scene, orbit, len(photographs)) | {"next": beyond},
             no_object=reason,
             photographs=photographs,
             size="" if mesh is None else mesh.size,
             score=score,
             score_note=note,
+            doubts=_doubts(model, scene),
+            next=beyond,
+            max_deviation=MAX_DEVIATION,
             pairs=_pairs(places[0] / "test", record),
             chart=_chart(places),
             video=_video(places),
@@ -132,62 +147,6 @@ def _orbit(scene: Scene | None, mesh: Mesh | None) -> Orbit:
     return orbit_of_box(torch.from_numpy(np.asarray(box)))
 
 
-def _object(mesh: Mesh, scene: Scene | None, orbit: Orbit, photographs: int) -> dict[str, Any]:
-    """The mesh as the page's program reads it: 16 bits a coordinate between two corners, 8 a colour."""
-    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-    places = np.round((mesh.vertices - low) / np.maximum(high - low, 1e-12) * _UINT16)
-    colours = np.full_like(places, 150) if mesh.colours is None else mesh.colours
-    wide = len(mesh.vertices) > _UINT16
-    # Between the cameras, not behind the first, whose photograph would stand in the way.
-    pose = orbit.pose(25.0).double().numpy()
-    return {
-        "low": low.tolist(),
-        "high": high.tolist(),
-        "places": _base64(places, "<u2"),
-        "colours": _base64(colours, "u1"),
-        "faces": _base64(mesh.faces, "<u4" if wide else "<u2"),
-        "wide": wide,
-        "up": orbit.up.tolist(),
-        "front": pose[:3, 2].tolist(),
-        "cameras": [] if scene is None else _cameras(scene.train, scene.world)[:photographs],
-    }
-
-
-def _base64(values: NDArray[Any], kind: str) -> str:
-    return base64.b64encode(np.ascontiguousarray(values, dtype=kind).tobytes()).decode()
-
-
-def _chosen(views: Views) -> list[int]:
-    count = min(_PHOTOGRAPHS, len(views))
-    return [int(i) for i in np.linspace(0, len(views) - 1, count).round()] if count else []
-
-
-def _cameras(views: Views, world: World) -> list[dict[str, Any]]:
-    """Pose (three rows of four) in the world of the files, and where the image ends at distance 1: left, right, below,
-    above."""
-    found = []
-    for i in _chosen(views):
-        pose = views.poses[i].double().cpu().numpy()
-        pose[:3, 3] = world.outward(pose[:3, 3])
-        fx, fy, cx, cy = views.intrinsics[i].tolist()
-        edges = [-cx / fx, (views.width - cx) / fx, (cy - views.height) / fy, cy / fy]
-        found.append({"pose": np.round(pose[:3], 6).flatten().tolist(), "edges": edges})
-    return found
-
-
-def _photographs(views: Views, background: torch.Tensor) -> list[tuple[str, str]]:
-    """Names and small images of the views, in the order of `_cameras`."""
-    chosen = _chosen(views)
-    found = []
-    for i in chosen:
-        alpha = views.rgba[i, ..., 3:]
-        image = views.rgba[i, ..., :3] * alpha + background * (1 - alpha)
-        small = Image.fromarray((image * 255).round().to(torch.uint8).cpu().numpy())
-        small.thumbnail((_THUMBNAIL, _THUMBNAIL))
-        found.append((views.names[i], data_uri(small, "jpeg")))
-    return found
-
-
 def _lead(record: Mapping[str, Any], scene: Scene | None) -> str:
     count = len(record.get("train_views") or ()) or (len(scene.train) if scene is not None else 0)
     return f"Made of {count} photographs by gridreg." if count else "Made by gridreg."
@@ -221,6 +180,24 @@ def _pairs(folder: Path, record: Mapping[str, Any]) -> list[dict[str, Any]]:
                 "images": [(label, encode(image)) for label, image in both if image is not None],
             }
         )
+    return found
+
+
+def _doubts(model: Model | None, scene: Scene | None) -> list[tuple[str, str]]:
+    """Renders of an ensemble from four sides, each beside how far its members differ."""
+    if scene is None or not getattr(model, "members", ()) or model is None or model.warp is not None:
+        return []
+    orbit = orbit_of_views(scene.train, scene.bounds)
+    lens = Lens.from_tensor(scene.train.intrinsics[0], scene.train.height, scene.train.width)
+    lens = lens.resized(min(_DOUBT, lens.width))
+    found = []
+    for azimuth in range(0, 360, 90):
+        rendered = model.render(Camera(orbit.pose(azimuth), lens), deviation=True)
+        assert rendered is not None
+        render, deviation = (
+            encode(Image.fromarray(to_image(rendered, mode))) for mode in ("rgb", "deviation")
+        )
+        found.append((render, deviation))
     return found
 
 

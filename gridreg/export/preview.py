@@ -12,6 +12,7 @@ from torch import nn
 import gridreg
 from gridreg import Handle, Regularizer
 from gridreg.errors import InputError
+from gridreg.export.images import MODES
 from gridreg.rendering import OccupancyGrid
 from gridreg.rendering.model import Model
 
@@ -54,6 +55,15 @@ class Preview:
     def masks(self) -> tuple[str, ...]:
         """Names of the regularizers that change what the field looks like, as in the table of the handle."""
         return tuple(self._regularizers)
+
+    @property
+    def modes(self) -> tuple[str, ...]:
+        """Those of `gridreg.export.images.MODES` that it has: an ensemble alone has a deviation."""
+        return (
+            MODES
+            if getattr(self._model, "members", ())
+            else tuple(mode for mode in MODES if mode != "deviation")
+        )
 
     @property
     def warped(self) -> bool:

@@ -90,14 +90,16 @@ def _frames(
     models: Sequence[Model], cameras: Sequence[Camera], modes: Sequence[str], depths: DepthRange | None
 ) -> Iterator[ImageArray]:
     for camera in cameras:
-        parts = [to_image(render, mode, depths) for render in _renders(models, camera) for mode in modes]
+        parts = [
+            to_image(render, mode, depths) for render in _renders(models, camera, modes) for mode in modes
+        ]
         if "depth" in modes and depths is not None:
             parts.append(colour_bar(camera.lens.height, depths))
         yield row(parts, gap=0)
 
 
-def _renders(models: Sequence[Model], camera: Camera) -> list[Rendered]:
-    renders = [model.render(camera) for model in models]
+def _renders(models: Sequence[Model], camera: Camera, modes: Sequence[str] = ()) -> list[Rendered]:
+    renders = [model.render(camera, deviation="deviation" in modes) for model in models]
     return [render for render in renders if render is not None]
 
 

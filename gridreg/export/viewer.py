@@ -85,9 +85,8 @@ class Viewer:
         self._wishes: list[tuple[Callable[[Any], None], Any]] = []
         self._closed = False
         self._pace = Pace()
-        steps = (self._preview.step, self._preview.total_steps)
-        masks = self._preview.masks
-        self._panel = Panel(self._server, masks, steps, self._touch, self._wish, size, pausable=pausable)
+        act = (self._touch, self._wish)
+        self._panel = Panel(self._server, self._preview, *act, size, pausable=pausable)
         self.curve = self._panel.curve
         self._stand(model, views)
         self._server.on_client_connect(self._connected)
@@ -254,14 +253,12 @@ class Viewer:
         wanted, look = screen.wanted, self._panel.look
         screen.served = time.monotonic()
         shape = browser.image_shape(screen.client, look.size)
-        if screen.drawn != wanted:
-            width = self._pace.moving(shape[1], shape[1] / shape[0])
-        else:
-            width = self._pace.sharper(screen.width, shape[1])
+        pace, first = self._pace, screen.drawn != wanted
+        width = pace.moving(shape[1], shape[1] / shape[0]) if first else pace.sharper(screen.width, shape[1])
         camera = browser.camera_of(screen.client, shape, width)
         start = time.monotonic()
         # A first image is always finished: something must be seen during a long movement.
-        rendered = self._render(camera, look, None if screen.drawn != wanted else screen, wanted)
+        rendered = self._render(camera, look, None if first else screen, wanted)
         if rendered is None:
             return
         self._pace.saw(camera.lens.height * camera.lens.width, time.monotonic() - start)
@@ -279,7 +276,9 @@ class Viewer:
         def given_up() -> bool:
             return self._closed or (screen is not None and screen.wanted != wanted)
 
-        return self._preview.at(look.step, look.off).render(camera, chunk=1 << 13, stop=given_up)
+        return self._preview.at(look.step, look.off).render(
+            camera, stop=given_up, deviation=look.mode == "deviation"
+        )
 
     def _compare(self, number: int) -> None:
         """Show the render of a training view beside its photograph."""

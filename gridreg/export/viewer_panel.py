@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from gridreg.export.images import MODES
+from gridreg.export.preview import Preview
 from gridreg.training.images import ImageArray
 
 __all__ = ["Look", "Panel", "short_labels"]
@@ -41,8 +42,7 @@ class Panel:
 
     Args:
         server: a ``viser.ViserServer``.
-        masks: names of the masks, one switch for each.
-        steps: step now and steps in all, for the slider; without masks there is none.
+        preview: names the masks, one switch for each, has the steps of the slider, and says what may be shown.
         changed: called whenever the look has changed.
         snapshot: called with the ``viser.ClientHandle`` that asked for an image.
         size: longer edge of the image at rest, pixels.
@@ -52,8 +52,7 @@ class Panel:
     def __init__(
         self,
         server: Any,
-        masks: Sequence[str],
-        steps: tuple[int, int],
+        preview: Preview,
         changed: Callable[[], None],
         snapshot: Callable[[Any], None],
         size: int,
@@ -62,9 +61,9 @@ class Panel:
     ) -> None:
         self._server, self._changed = server, changed
         self.paused = False
-        self._pinned, self._reached = False, steps[0]
+        self._pinned, self._reached = False, preview.step
         self._status = server.gui.add_markdown("waiting for the first image")
-        self._mode = server.gui.add_dropdown("Show", MODES, initial_value=MODES[0])
+        self._mode = server.gui.add_dropdown("Show", preview.modes, initial_value=MODES[0])
         self._size = server.gui.add_slider(
             "Resolution",
             min=_SMALLEST,
@@ -75,8 +74,8 @@ class Panel:
         )
         self._step: Any = None
         self._switches: dict[str, Any] = {}
-        if masks:
-            self._add_masks(server, masks, steps)
+        if preview.masks:
+            self._add_masks(server, preview.masks, (preview.step, preview.total_steps))
         self.cameras = server.gui.add_checkbox("Training cameras", True)
         button = server.gui.add_button("Snapshot", hint="saves this image at full resolution")
         button.on_click(lambda event: snapshot(event.client))

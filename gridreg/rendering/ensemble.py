@@ -11,7 +11,21 @@ from torch import Tensor, nn
 from gridreg.errors import InputError
 from gridreg.rendering.occupancy import OccupancyGrid
 
-__all__ = ["Ensemble"]
+__all__ = ["Ensemble", "deviation_of"]
+
+
+def deviation_of(images: Tensor) -> Tensor:
+    """Return how far images of several members are apart, by pixel: the root mean square, over the channels, of their
+    standard deviation.
+
+    Args:
+        images: ``(M, ..., C)`` of at least two members.
+
+    Example:
+        >>> deviation_of(torch.tensor([[[0.0, 0.5]], [[0.2, 0.5]]])).tolist()
+        [0.10000000149011612]
+    """
+    return images.var(dim=0).mean(dim=-1).sqrt()
 
 
 class Ensemble(nn.Module):

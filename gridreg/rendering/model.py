@@ -66,7 +66,12 @@ class Model:
 
     @torch.no_grad()
     def render(
-        self, camera: Camera, *, chunk: int = 1 << 13, stop: Callable[[], bool] | None = None
+        self,
+        camera: Camera,
+        *,
+        chunk: int = 1 << 13,
+        stop: Callable[[], bool] | None = None,
+        deviation: bool = False,
     ) -> Rendered | None:
         """An image; the result does not depend on ``chunk``.
 
@@ -74,11 +79,17 @@ class Model:
             camera: from where.
             chunk: rays at once.
             stop: asked between chunks; True gives the image up.
+            deviation: also how far members are apart, which an ensemble alone has.
 
         Returns:
             colour ``(H, W, 3)`` in [0, 1], opacity and depth ``(H, W)``, on the CPU wherever the field is; None if it
             was given up.
+
+        Raises:
+            InputError: for the deviation of what is no ensemble.
         """
+        if deviation:
+            raise InputError("deviation: found one run, expected an ensemble (gridreg ensemble RUN RUN ...)")
         device = self.field.bounds.device
         lens = camera.lens
         rays = camera_rays(

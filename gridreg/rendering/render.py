@@ -85,6 +85,7 @@ class Rendered:
         depth: ``(R,)`` weighted mean distance times opacity, world units (0 where nothing was hit).
         samples: the samples behind them; None for whole images.
         coloured: ``(M,)`` int64, those of them whose colour was computed; None where that is not known.
+        deviation: ``(R,)`` how far the members of an ensemble are apart; None where that was not asked for.
     """
 
     colour: Tensor
@@ -92,6 +93,7 @@ class Rendered:
     depth: Tensor
     samples: RaySamples | None = None
     coloured: Tensor | None = None
+    deviation: Tensor | None = None
 
 
 def _march(

@@ -113,12 +113,12 @@ if (gl) {
   const columns = Math.ceil(Math.sqrt(data.cameras.length)) || 1;
   const accent = getComputedStyle(document.documentElement).getPropertyValue("--up").trim();
   const shade = [1, 3, 5].map((i) => parseInt(accent.slice(i, i + 2), 16) / 255);
-  data.cameras.forEach(({ pose, edges: [l, r, b, t] }, i) => {
+  [...data.cameras, ...(data.next ? [data.next] : [])].forEach(({ pose, edges: [l, r, b, t] }, i) => {
     const place = [pose[3], pose[7], pose[11]];
     const at = (x, y) => [0, 1, 2].map((k) => place[k] + DEPTH * (pose[4 * k] * x + pose[4 * k + 1] * y - pose[4 * k + 2]));
     const ring = [at(l, t), at(r, t), at(r, b), at(l, b)];
     ring.forEach((corner, k) => lines.push(...place, ...corner, ...corner, ...ring[(k + 1) % 4]));
-    for (let k = 0; k < 16; k++) shades.push(...shade);
+    for (let k = 0; k < 16; k++) shades.push(...(i < data.cameras.length ? shade : [0.85, 0.2, 0.55]));
     const [u, v] = [i % columns, Math.floor(i / columns)].map((x) => x / columns), s = 1 / columns;
     const uv = [[u, v], [u + s, v], [u + s, v + s], [u, v + s]];
     for (const k of [0, 1, 2, 0, 2, 3]) { squares.push(...ring[k]); textures.push(...uv[k], 0); }
@@ -163,6 +163,11 @@ if (gl) {
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, faces);
     gl.drawElements(gl.TRIANGLES, corners.byteLength / (data.wide ? 4 : 2), wide, 0);
     if (!data.cameras.length || !shown.checked) return;
+    if (data.next) {
+      use(solid, [0, 0, 0], [1, 1, 1]);
+      linePlaces(0); lineShades(1);
+      gl.drawArrays(gl.LINES, 16 * data.cameras.length, 16);
+    }
     // The photograph of a camera that one looks out of would hide all.
     data.cameras.forEach(({ pose }, i) => {
       if (Math.hypot(from[0] - pose[3], from[1] - pose[7], from[2] - pose[11]) < DEPTH) return;
