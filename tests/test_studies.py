@@ -94,6 +94,10 @@ ROWS = {
         "best", "depth smoothness 0.001", "depth smoothness as in RegNeRF", "divergence of neighbours",
         "space annealing", "gradients by distance",
     ],
+    "few_pieces": [
+        "few", "all gradients near cameras", "no smooth depth", "no occlusion loss", "total variation as in quick",
+        "total variation 0.3", "sample space annealing",
+    ],
     "best_components": ["best", "24 components of appearance"],
     "best_background": ["drawn backgrounds", "backgrounds in expectation"],
     "best_full": ["best", "distortion 0.01", "learning rate of grids 0.04", "total variation 0.006"],
@@ -131,6 +135,7 @@ def scenes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (tmp_path / "nerf_synthetic" / scene).mkdir(parents=True)
     for subject in ("subject_a", "subject_b"):
         (tmp_path / "human" / subject).mkdir(parents=True)
+    (tmp_path / "real" / "fox").mkdir(parents=True)
     monkeypatch.setenv("GRIDREG_DATA", str(tmp_path))
     return tmp_path
 
