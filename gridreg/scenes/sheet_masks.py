@@ -30,6 +30,8 @@ _CLOSE = 0.06
 _REACH = 1.2
 """Metres from the sheet's middle up to which the table is looked at."""
 _VOXELS = 128
+_OTHERS = 12
+"""Photographs at most that each is compared with."""
 _AROUND = np.ones((3, 3), dtype=bool)
 
 
@@ -103,14 +105,14 @@ def cut_from_sheet(views: Sequence[SheetView], board: Board) -> list[Mask] | Non
         linear = (view.rgb / np.float32(255)) ** np.float32(_GAMMA)
         paper = np.percentile(linear[white], 70, axis=0).clip(1e-3)
         view.colours = np.asarray((linear / paper) ** (1 / _GAMMA), dtype=np.float32)
+    grid = _grid(board)
     ranges = [
         [f(view.colours, size=(3, 3, 1)) for f in (ndimage.minimum_filter, ndimage.maximum_filter)]
         for view in views
     ]
     for i, (view, printed) in enumerate(zip(views, prints, strict=True)):
-        agreeing, seen = _agreement(i, views, places[i], ranges)
+        agreeing, seen = _agreement(i, views, places[i], ranges, _near_object(view, grid))
         _sort_pixels(view, printed, agreeing, seen)
-    grid = _grid(board)
     hull = _hull(views, grid)
     if not hull.any():
         return None
@@ -134,19 +136,23 @@ def _print_at(places: Array, board: Board, page: Array) -> Array:
 
 
 def _agreement(
-    i: int, views: Sequence[SheetView], places: Array, ranges: Sequence[Sequence[NDArray[np.float32]]]
+    i: int,
+    views: Sequence[SheetView],
+    places: Array,
+    ranges: Sequence[Sequence[NDArray[np.float32]]],
+    near: Mask,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """By pixel of a view, how many others see the same colour at that place of the table, and how many see it."""
-    met = np.isfinite(places[..., 0])
+    """By pixel ``near`` the object: how many others see the same colour at its place of the table, how many see it."""
+    met = np.isfinite(places[..., 0]) & near
     points, colours = places[met], views[i].colours[met]
     agreeing, seen = np.zeros((2, *met.shape), dtype=np.int64)
-    for j, other in enumerate(views):
-        if j != i:
-            (rows, columns), inside = (found := other.pixels(points))[0].T, found[1]
-            low, high = (bound[rows, columns] for bound in ranges[j])
-            off = np.maximum(low - colours, colours - high).max(axis=-1)
-            agreeing[met] += inside & (off < _CLOSE)
-            seen[met] += inside
+    others = [j for j in range(len(views)) if j != i]
+    for j in others[:: -(-len(others) // _OTHERS)]:
+        (rows, columns), inside = (found := views[j].pixels(points))[0].T, found[1]
+        low, high = (bound[rows, columns] for bound in ranges[j])
+        off = np.maximum(low - colours, colours - high).max(axis=-1)
+        agreeing[met] += inside & (off < _CLOSE)
+        seen[met] += inside
     return agreeing, seen
 
 
@@ -169,6 +175,18 @@ def _sort_pixels(
     beside = np.unique(labels[ndimage.binary_dilation(view.table, _AROUND) & white])
     view.paper = np.isin(labels, beside[beside > 0])
     view.above = (seen >= 2) & ~view.table & ~view.paper
+
+
+def _near_object(view: SheetView, grid: Array) -> Mask:
+    """The rectangle of an image that voxels project to, and a margin."""
+    found, inside = view.pixels(grid[:: _VOXELS // 8, :: _VOXELS // 8, :: _VOXELS // 8].reshape(-1, 3))
+    near = np.zeros(view.rgb.shape[:2], dtype=bool)
+    if inside.any():
+        low, high = found[inside].min(axis=0), found[inside].max(axis=0)
+        margin = (high - low) // 6
+        top, left = np.maximum(low - margin, 0)
+        near[top : high[0] + margin[0], left : high[1] + margin[1]] = True
+    return near
 
 
 def _larger(mask: Mask, fraction: float) -> Mask:
