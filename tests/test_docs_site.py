@@ -200,6 +200,11 @@ def test_search_works_from_disk(tmp_path: Path) -> None:
         tab.call("Input.dispatchKeyEvent", type="keyUp", key="n", code="KeyN")
         tab.until(lambda: tab.evaluate("document.querySelectorAll('.md-search-result__item').length > 3"))
         assert tab.evaluate("document.documentElement.scrollWidth <= innerWidth")
+        tab.open(f"file://{site / 'catalogue.html'}")
+        assert tab.evaluate(
+            "document.querySelector('table').scrollWidth <= document.querySelector('article').clientWidth"
+        )
+        assert tab.evaluate("document.querySelectorAll('td math').length") >= 30
         # A line of code of 100 characters is not cut.
         tab.open(f"file://{site / 'own-field.html'}")
         code = "[...document.querySelectorAll('pre > code')].filter(c => c.querySelector('.k, .kn'))"

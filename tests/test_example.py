@@ -89,3 +89,22 @@ def test_its_help_and_options_are_those_of_gridreg_train():
     )
     assert "--preset" in done.stdout
     assert Path(PATH).name in done.stdout
+
+
+def test_the_score_is_printed_before_mesh_and_video_are_made(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    drawn = []
+    monkeypatch.setattr(
+        "gridreg.cli.train.draw_run", lambda *_, **__: drawn.append(capsys.readouterr().out) or []
+    )
+    scene = builtin_scene(tmp_path, size=32)
+    small = (
+        "train.rays=64",
+        "train.voxels_start=1728",
+        "train.voxels_end=1728",
+        "train.occupancy_resolution=16",
+    )
+    assert run(TrainOptions(scene=scene, steps=2, out=tmp_path / "run", set=small)) == 0
+    (before,) = drawn
+    assert "PSNR" in before
+    assert "trained in" in before

@@ -185,3 +185,13 @@ def test_terms_of_peers_lead_to_the_place(term: str) -> None:
         text=True,
     ).stdout.split()
     assert any(path.startswith(TERMS[term]) for path in found), found
+
+
+def test_the_map_is_short_and_names_every_room() -> None:
+    text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    assert len(text.split()) <= 900
+    rooms = sorted(path.parent.name for path in (ROOT / "gridreg").glob("*/__init__.py"))
+    missing = [room for room in rooms if f"`gridreg/{room}/`" not in text]
+    assert not missing
+    for place in re.findall(r"`((?:gridreg|tests|docs|backbones|ops)/[\w/.]*)`", text):
+        assert (ROOT / place).exists() or (ROOT / "gridreg" / place).exists(), place

@@ -4,6 +4,7 @@ import json
 import math
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import torch
 import gridreg
 from gridreg.errors import InputError
 from gridreg.fields import field_names, make_field, register_field
+from gridreg.ops import compilation
 from gridreg.scenes import builtin_scene, load_scene
 from gridreg.training import RunConfig, TrainSettings, build_trainer, execute, load_run
 from gridreg.training.events import resolution_of
@@ -341,3 +343,20 @@ def test_nothing_to_draw_is_said_in_one_line(scene, reshuffle):
 def test_options_of_a_field_are_checked(scene, field, message):
     with pytest.raises(InputError, match=message):
         build_trainer(RunConfig(field=field, train=TINY), scene)
+
+
+def test_compiling_and_pauses_are_no_time_of_training(scene, tmp_path):
+    """Or the first row of a study would seem slower than the others, by the kernels that it compiles."""
+
+    def each(report):
+        with compilation.timed() if len(losses) % 2 else compilation.clock_stopped():
+            time.sleep(0.3)
+        losses.append(report["loss"])
+
+    losses = []
+    settings = replace(TINY, steps=8, resample_at=(), occupancy_at=(), shrink_at=(), filter_rays_at=())
+    config = RunConfig(field={"density_components": 4, "appearance_components": 4}, train=settings)
+    began = time.perf_counter()
+    _, metrics = execute(config, scene, tmp_path / "run", on_step=each)
+    assert len(losses) == 8
+    assert metrics["seconds"]["train"] + 2.4 <= time.perf_counter() - began
