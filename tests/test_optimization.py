@@ -58,6 +58,16 @@ class TestSplitGroups:
         assert len(result) == 2
         assert parts[0] is result[0]
 
+    def test_parameters_with_their_names(self) -> None:
+        field = Field()
+        groups: list[dict[str, Any]] = [{"params": list(field.named_parameters()), "lr": 0.1}]
+        result, parts = split_groups(groups, [field.line])
+        assert [[name for name, _ in group["params"]] for group in result] == [
+            ["plane", "decoder.weight", "decoder.bias"],
+            ["line"],
+        ]
+        assert parts == [result[1]]
+
     def test_parameters_that_no_group_holds(self) -> None:
         with pytest.raises(InputError, match="none holds a parameter of the site"):
             split_groups(groups_of(Field()), [Field().line])

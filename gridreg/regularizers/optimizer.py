@@ -47,8 +47,8 @@ def split_groups(groups: Groups, chosen: Iterable[Tensor]) -> tuple[Groups, Grou
     parts: Groups = []
     for group in groups:
         params = list(group["params"])
-        rest = [parameter for parameter in params if id(parameter) not in wanted]
-        part = [parameter for parameter in params if id(parameter) in wanted]
+        rest = [entry for entry in params if id(_tensor(entry)) not in wanted]
+        part = [entry for entry in params if id(_tensor(entry)) in wanted]
         if rest or not part:
             result.append({**group, "params": rest})
         if part:
@@ -62,7 +62,14 @@ def split_groups(groups: Groups, chosen: Iterable[Tensor]) -> tuple[Groups, Grou
 def _groups_of(groups: Groups, grids: Sequence[Grid]) -> Groups:
     """Groups that hold nothing but parameters of the site."""
     ours = {id(grid.parameter) for grid in grids}
-    return [group for group in groups if group["params"] and all(id(p) in ours for p in group["params"])]
+    return [
+        group for group in groups if group["params"] and all(id(_tensor(p)) in ours for p in group["params"])
+    ]
+
+
+def _tensor(entry: Any) -> Any:
+    """The tensor of an entry of a group, which may stand there with its name."""
+    return entry[1] if isinstance(entry, tuple) else entry
 
 
 @register
