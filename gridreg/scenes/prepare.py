@@ -276,7 +276,9 @@ def _write(
 def _shows_room(frame: Frame, scene: Path) -> bool:
     """Tell whether an image is neither transparent anywhere nor on one colour."""
     rgba = torch.from_numpy(read_rgba(scene / frame.file_path, opaque=True))[None]
-    return Views(rgba, torch.eye(4)[None], torch.ones(1, 4), ("image",), (0,)).shows_room
+    # Any camera that fits the image: its colours alone are asked for.
+    camera = torch.full((1, 4), float(max(rgba.shape)))
+    return Views(rgba, torch.eye(4)[None], camera, ("image",), (0,)).shows_room
 
 
 def _upwards(up: Array) -> Array:
