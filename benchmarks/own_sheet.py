@@ -97,8 +97,8 @@ def with_test_views(scene: Path, truth: Path, out: Path, *, true: bool) -> Path:
     for name, entry in found.items():
         own, frame = known[name], dict(entry)
         if true:
-            scale = min(size["w"], size["h"]) / min(own["w"], own["h"])
-            # Crops begin at whole pixels of the photograph, so the estimated camera tells which.
+            # Crops begin and end at whole pixels of the photograph, so the estimated camera tells which.
+            scale = size["w"] / round(size["w"] * own["fl_x"] / entry["fl_x"])
             start = [round(own[key] - entry[key] / scale) for key in ("cx", "cy")]
             frame |= {
                 "fl_x": own["fl_x"] * scale,
@@ -114,7 +114,7 @@ def with_test_views(scene: Path, truth: Path, out: Path, *, true: bool) -> Path:
     tests = [name for name in known if name not in found and name.startswith("test_")]
     for name in tests:
         own = known[name]
-        scale = min(size["w"], size["h"]) / min(own["w"], own["h"])
+        scale = size["fl_x"] / known[Path(size["file_path"]).name]["fl_x"]
         frame = {
             **own,
             "w": size["w"],
@@ -122,7 +122,9 @@ def with_test_views(scene: Path, truth: Path, out: Path, *, true: bool) -> Path:
             "fl_x": own["fl_x"] * scale,
             "fl_y": own["fl_y"] * scale,
         }
-        frame |= {"cx": size["w"] / 2, "cy": size["h"] / 2}
+        rows, columns = np.nonzero(_read(truth / own["mask_path"])[..., 0])
+        frame["cx"] = size["w"] / 2 - scale * ((columns.min() + columns.max()) / 2 - own["cx"])
+        frame["cy"] = size["h"] / 2 - scale * ((rows.min() + rows.max()) / 2 - own["cy"])
         for key in ("file_path", "mask_path"):
             cut = cut_like(_read(truth / own[key]), own, frame, scale)
             Image.fromarray(cut.squeeze().round().astype(np.uint8)).save(out / own[key])

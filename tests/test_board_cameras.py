@@ -16,7 +16,7 @@ import torch
 from PIL import ExifTags, Image, ImageFilter, ImageOps
 
 from gridreg.errors import InputError
-from gridreg.scenes import Prepared, builtin_photographs, load_scene, prepare
+from gridreg.scenes import Prepared, builtin_photographs, load_scene, photograph_mesh, prepare
 from gridreg.scenes.board import BOARDS, get_board
 from gridreg.scenes.board_cameras import board_extent, look_for_board, place_on_board
 from gridreg.scenes.bundle_adjustment import Photograph
@@ -87,7 +87,7 @@ class TestPrepare:
     def test_lens_is_true(self, prepared: Prepared, made: Path) -> None:
         content = json.loads((prepared.folder / "transforms.json").read_text())
         for frame in content["frames"]:
-            assert frame["w"] == frame["h"] == 300
+            assert frame["w"] == frame["h"] < 200
             assert frame["fl_x"] == pytest.approx(0.735 * SIZE, rel=0.005)
             assert frame["k1"] == pytest.approx(0.055, abs=0.02)
 
@@ -96,6 +96,19 @@ class TestPrepare:
         assert 0.06 * 2.46 < prepared.extent.bounds[1, 2] < 0.42
         content = json.loads((prepared.folder / "transforms.json").read_text())
         assert (content["gridreg"]["unit"], content["gridreg"]["board"]) == ("metre", "a4")
+
+    def test_photographs_are_cut_to_the_object(self, prepared: Prepared, made: Path) -> None:
+        vertices, truth = photograph_mesh(0.05)[0], truth_of(made)
+        files = read_transforms(prepared.folder)
+        for frame in (*files.train, *files.test):
+            width, height = (int(edge) for edge in frame.camera.size or (0, 0))
+            mask = np.asarray(Image.open(prepared.folder / str(frame.mask_path)))
+            assert mask.shape == (height, width)
+            pose = truth[Path(frame.file_path).name].pose
+            places = project_points(dataclasses.replace(frame, pose=pose), vertices)
+            assert ((places > 0) & (places < [width, height])).all(axis=1).mean() > 0.99
+            # The object fills what is left.
+            assert np.ptp(places, axis=0).max() > 0.6 * width
 
     def test_scene_is_trained_on_at_home_and_its_world_is_in_metres(self, prepared: Prepared) -> None:
         scene = load_scene(prepared.folder, "holdout8")
@@ -112,13 +125,14 @@ class TestPrepare:
         tight = load_scene(prepared.folder, "holdout8", bounds=[[-0.06, -0.06, 0], [0.06, 0.06, 0.15]])
         torch.testing.assert_close(tight.bounds[1], torch.tensor([1.04, 1.04, 1.3]))
 
-    def test_crops_show_what_their_cameras_say(self, prepared: Prepared, made: Path, tmp_path: Path) -> None:
+    def test_crops_show_what_their_cameras_say(self, made: Path, tmp_path: Path) -> None:
+        whole = prepare(made / "photographs", tmp_path / "whole", masks="none")
         seen = look_for_board(
-            [(path, (300, 300), None) for path in sorted((prepared.folder / "images").iterdir())]
+            [(path, (300, 300), None) for path in sorted((whole.folder / "images").iterdir())]
         )
         assert seen is not None
         board, found = seen
-        files = read_transforms(prepared.folder)
+        files = read_transforms(whole.folder)
         frames = {Path(frame.file_path).name: frame for frame in (*files.train, *files.test)}
         off = []
         for photograph in found:
@@ -132,7 +146,11 @@ class TestPrepare:
 
 
 def project(frame: Frame, corners: np.ndarray) -> np.ndarray:
-    x, y, z = ((np.pad(corners, ((0, 0), (0, 1))) - frame.pose[:3, 3]) @ frame.pose[:3, :3]).T
+    return project_points(frame, np.pad(corners, ((0, 0), (0, 1))))
+
+
+def project_points(frame: Frame, points: np.ndarray) -> np.ndarray:
+    x, y, z = ((points - frame.pose[:3, 3]) @ frame.pose[:3, :3]).T
     x, y = frame.camera.distortion.distort(x / -z, y / z)
     fx, fy, cx, cy = frame.camera.intrinsics(0, 0)
     return np.stack([fx * x + cx, fy * y + cy], axis=-1)

@@ -63,6 +63,8 @@ def run(options: ReconstructOptions) -> int:
         threads=options.threads,
         device=options.device,
         video=False,
+        # A telephone chooses exposure and white balance anew for each photograph.
+        set=("train.exposure=true",),
         resume=has_checkpoint(options.out / "checkpoint"),
     )
     # A wrong option is said before an hour of work, not after it.

@@ -93,7 +93,7 @@ def prepare(
     Args:
         source: a folder of images, or a video, of which the sharpest frames are taken: the sheet of `gridreg board`
             gives the cameras where it is seen, else pycolmap; or a scene whose cameras COLMAP, nerfstudio or
-            instant-ngp found. Images of several sizes are cut to one.
+            instant-ngp found. Images of several sizes are cut to one, those on the sheet to the object.
         out: the scene folder to make; must not exist.
         masks: folder with a mask for every image (white is kept), which becomes its alpha: called like the
             image, with the extension ``.png`` instead of its own or after it; or a way to cut them, see
@@ -215,8 +215,9 @@ def _write(
     """Write ``transforms.json`` and ``cameras.png`` in normalised coordinates."""
     frames, sizes = made.frames, {f"images/{image.path.name}": image.size for image in made.copied}
     size = sizes[frames[0].file_path]
-    if len({sizes[frame.file_path] for frame in frames}) > 1:
-        frames, size = crop_to_one_size(frames, scene, sizes)
+    cut = made.board is not None and all(frame.mask_path for frame in frames)
+    if cut or len({sizes[frame.file_path] for frame in frames}) > 1:
+        frames, size = crop_to_one_size(frames, scene, sizes, to_masks=cut)
     intrinsics = np.array([frame.camera.intrinsics(*size) for frame in frames])
     poses = np.stack([frame.pose for frame in frames])
     check_cameras(poses, intrinsics, size, [frame.where for frame in frames])
