@@ -278,7 +278,8 @@ def _shows_room(frame: Frame, scene: Path) -> bool:
     """Tell whether an image is neither transparent anywhere nor on one colour."""
     rgba = torch.from_numpy(read_rgba(scene / frame.file_path, opaque=True))[None]
     # Any camera that fits the image: its colours alone are asked for.
-    camera = torch.full((1, 4), float(max(rgba.shape)))
+    height, width = rgba.shape[1:3]
+    camera = torch.tensor([[width, width, width / 2, height / 2]])
     return Views(rgba, torch.eye(4)[None], camera, ("image",), (0,)).shows_room
 
 
