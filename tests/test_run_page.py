@@ -63,7 +63,12 @@ def folder(tmp_path: Path) -> Path:
         scores[name] = {"psnr": 20 + value, "ssim_gaussian": value}
         save_view(tmp_path / "test", name, image, target, metrics=scores[name])
     record = {"scene": NAME, "mean": {"psnr": 20.375, "ssim_gaussian": 0.375}, "images": scores}
-    more = {"test_views": 2, "protocol": "all", "train_views": list("abcdef"), "command": ["gridreg", NAME]}
+    more = {
+        "test_views": 2,
+        "protocol": "all",
+        "train_views": list("abcdef"),
+        "command": ["gridreg", NAME, "a/long/path" * 20],
+    }
     write_json(tmp_path / "metrics.json", {**record, **more})
     lines = [json.dumps({"step": step, "psnr": 10.0 + step}) for step in range(1, 9)]
     (tmp_path / "history.jsonl").write_text("\n".join(lines) + "\n")

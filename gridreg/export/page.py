@@ -76,7 +76,10 @@ def write_page(
     photographs = [] if scene is None else photographs_of(scene.train, scene.background)
     score, note = _score(record)
     beyond = next_camera(_found(places, "next.json"))
-    name = record.get("scene") or (scene.name if scene is not None else Path(folder).resolve().name)
+    name = record.get("scene") or (scene.name if scene is not None else "scene")
+    if name == "scene":
+        # As gridreg reconstruct calls every scene.
+        name = Path(folder).resolve().name
     text = (
         _environment()
         .get_template("run.html")
@@ -159,7 +162,8 @@ def _score(record: Mapping[str, Any]) -> tuple[list[tuple[str, str]], str]:
     shown = [("PSNR", f"{mean.pop('psnr'):.2f} dB")] if "psnr" in mean else []
     shown += [("SSIM" if name == "ssim_gaussian" else name, f"{value:.4f}") for name, value in mean.items()]
     views, protocol = record.get("test_views"), record.get("protocol")
-    return shown, f"Mean of {views} views that were not trained on, protocol {protocol}."
+    what = "One view that was" if views == 1 else f"Mean of {views} views that were"
+    return shown, f"{what} not trained on, protocol {protocol}."
 
 
 def _pairs(folder: Path, record: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -168,9 +168,9 @@ if (gl) {
       linePlaces(0); lineShades(1);
       gl.drawArrays(gl.LINES, 16 * data.cameras.length, 16);
     }
-    // The photograph of a camera that one looks out of would hide all.
+    // The photograph of a camera that one looks out of, or that is close by, would hide all.
     data.cameras.forEach(({ pose }, i) => {
-      if (Math.hypot(from[0] - pose[3], from[1] - pose[7], from[2] - pose[11]) < DEPTH) return;
+      if (Math.hypot(from[0] - pose[3], from[1] - pose[7], from[2] - pose[11]) < Math.max(DEPTH, 0.4 * view.distance)) return;
       use(solid, [0, 0, 0], [1, 1, 1]);
       linePlaces(0); lineShades(1);
       gl.drawArrays(gl.LINES, 16 * i, 16);
