@@ -95,7 +95,8 @@ ROWS = {
         "space annealing", "gradients by distance",
     ],
     "few_pieces": [
-        "few", "all gradients near cameras", "no smooth depth", "no occlusion loss", "total variation as in quick",
+        "few", "all gradients near cameras", "no smooth depth", "no occlusion loss", "occlusion loss 0.01",
+        "total variation as in quick",
         "total variation 0.3", "sample space annealing",
     ],
     "best_components": ["best", "24 components of appearance"],
