@@ -43,7 +43,7 @@ _STAGES = {
         ("OccupiedSpace.filter_rays", "filtering of rays"),
     ],
     "gridreg.export.runs": [("write_mesh", "mesh"), ("render_video", "video")],
-    "gridreg.export.mesh": [("extract_mesh", "mesh cut"), ("save_mesh", "mesh file")],
+    "gridreg.export.mesh_files": [("extract_mesh", "mesh cut"), ("save_mesh", "mesh file")],
     "gridreg.export.writers": [("_write_mp4", "video file"), ("_finish", "video end")],
     "gridreg.ablation.store": [
         ("Store.add", "study taken in"),

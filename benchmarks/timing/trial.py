@@ -8,13 +8,17 @@ import os
 import shutil
 import signal
 import subprocess
+import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import torch
+import torch._dynamo
+from PIL import Image
 
+import backbones  # noqa: F401
 import gridreg.export.runs
 from gridreg.ablation.store import Store
 from gridreg.cli import main as gridreg_main
@@ -33,6 +37,9 @@ __all__ = [
     "what_stands",
 ]
 
+# What a run imports late is imported here once, not in each of the forked processes.
+Image.init()
+
 # Told apart in every run: seconds, dates, commands.
 PASSING = {"seconds", "command", "date", "machine", "started", "ended", "versions"}
 
@@ -47,6 +54,8 @@ def in_child(act: Callable[[], int], log: Path) -> int:
                 os.dup2(stream.fileno(), 1)
                 os.dup2(stream.fileno(), 2)
             status = act()
+        except BaseException:
+            traceback.print_exc()
         finally:
             os._exit(status)
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
