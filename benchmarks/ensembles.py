@@ -117,7 +117,7 @@ def deviation_record(joined: LoadedRun, scene: Scene) -> Record:
         assert rendered is not None
         assert rendered.deviation is not None
         error, deviation = (rendered.colour - targets[i]).square().mean(-1).sqrt(), rendered.deviation
-        seen = (rendered.opacity > 0.5) | (views.rgba[i, ..., 3] > 0.5)
+        seen = (rendered.opacity > 0.5) | (views.image(i)[..., 3] > 0.5)
         pixels[name] = float(spearmanr(deviation[seen], error[seen])[0])
         everywhere[name] = float(spearmanr(deviation.flatten(), error.flatten())[0])
         means.append([float(value.square().mean()) for value in (deviation, error)])

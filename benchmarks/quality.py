@@ -67,7 +67,7 @@ def on_paper(scene: Scene) -> Scene:
 
     def flat(views: Views) -> Views:
         rgb = views.composited(scene.background)
-        return replace(views, rgba=torch.cat([rgb, torch.ones_like(rgb[..., :1])], dim=-1))
+        return replace(views, pixels=torch.cat([rgb, torch.ones_like(rgb[..., :1])], dim=-1))
 
     validation = None if scene.validation is None else flat(scene.validation)
     return replace(scene, train=flat(scene.train), test=flat(scene.test), validation=validation)

@@ -48,7 +48,7 @@ def in_room(views: Views) -> Views:
     ]
     alpha = views.rgba[..., 3:]
     rgb = views.rgba[..., :3] * alpha + (1 - alpha) * torch.stack(behind)
-    return replace(views, rgba=torch.cat([rgb, torch.ones_like(alpha)], dim=-1))
+    return replace(views, pixels=torch.cat([rgb, torch.ones_like(alpha)], dim=-1))
 
 
 def room(folder: Path) -> Scene:

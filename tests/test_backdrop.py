@@ -69,7 +69,7 @@ def test_a_room_is_no_backdrop(opaque):
     scene = load_scene(opaque, "holdout8")
     rgba = scene.train.rgba.clone()
     rgba[:, :4, :, :3] = torch.rand(rgba[:, :4, :, :3].shape, generator=torch.Generator().manual_seed(0))
-    room = replace(scene, train=replace(scene.train, rgba=rgba))
+    room = replace(scene, train=replace(scene.train, pixels=rgba))
     assert room.train.backdrop is None
     # Without surroundings, that is: what is behind the box is learned otherwise.
     alone = replace(CONFIG, train=replace(CONFIG.train, surroundings=False))

@@ -51,7 +51,7 @@ def exposed(scene, truth):
     """The same photographs, darker than any of them could clip, each with its gains."""
     rgba = scene.train.rgba.clone()
     rgba[..., :3] = 0.6 * rgba[..., :3] * truth[:, None, None]
-    return replace(scene, train=replace(scene.train, rgba=rgba))
+    return replace(scene, train=replace(scene.train, pixels=rgba))
 
 
 def test_known_gains_are_found(scene, exposed, truth):
@@ -88,7 +88,7 @@ def test_wanted_where_it_is_said(scene):
     assert not wants_exposure(scene, TrainSettings())
     one = replace(
         scene.train,
-        **{name: getattr(scene.train, name)[:1] for name in ("rgba", "poses", "intrinsics", "names", "ids")},
+        **{name: getattr(scene.train, name)[:1] for name in ("pixels", "poses", "intrinsics", "names", "ids")},
     )
     assert not wants_exposure(replace(scene, train=one), CONFIG.train)
 

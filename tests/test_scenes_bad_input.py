@@ -223,7 +223,7 @@ def test_cameras_that_look_away(scene: Path) -> None:
 class TestViews:
     def views(self, **changes: Any) -> Views:
         fields: dict[str, Any] = {
-            "rgba": torch.zeros(2, 3, 4, 4),
+            "pixels": torch.zeros(2, 3, 4, 4),
             "poses": torch.eye(4).repeat(2, 1, 1),
             "intrinsics": torch.ones(2, 4),
             "names": ("a", "b"),
@@ -239,7 +239,10 @@ class TestViews:
     @pytest.mark.parametrize(
         ("changes", "pattern"),
         [
-            ({"rgba": torch.zeros(2, 3, 4, 3)}, r"rgba: found shape \(2, 3, 4, 3\), expected \(V, H, W, 4\)"),
+            (
+                {"pixels": torch.zeros(2, 3, 4, 3)},
+                r"pixels: found shape \(2, 3, 4, 3\), expected \(V, H, W, 4\)",
+            ),
             ({"poses": torch.zeros(2, 3, 4)}, r"poses: found shape \(2, 3, 4\), expected \(2, 4, 4\)"),
             ({"intrinsics": torch.zeros(1, 4)}, r"intrinsics: found shape \(1, 4\), expected \(2, 4\)"),
             ({"names": ("a",)}, "names, ids: found 1 and 2, expected 2 each"),

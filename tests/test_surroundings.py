@@ -45,7 +45,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Scene:
         )
         alpha = views.rgba[..., 3:]
         rgb = views.rgba[..., :3] * alpha + (1 - alpha) * behind
-        return replace(views, rgba=torch.cat([rgb, torch.ones_like(alpha)], dim=-1))
+        return replace(views, pixels=torch.cat([rgb, torch.ones_like(alpha)], dim=-1))
 
     return replace(scene, train=opaque(scene.train), test=opaque(scene.test))
 
@@ -127,7 +127,7 @@ def test_wanted_where_there_is_something_behind(room):
     assert build_trainer(CONFIG, replace(room, ndc=True)).beside.surroundings is None
     clear = room.train.rgba.clone()
     clear[0, 0, 0, 3] = 0
-    transparent = replace(room, train=replace(room.train, rgba=clear))
+    transparent = replace(room, train=replace(room.train, pixels=clear))
     assert build_trainer(CONFIG, transparent).beside.surroundings is None
     outward = room.train.poses.clone()
     outward[:, :3, :3] *= torch.tensor([-1.0, 1.0, -1.0])
@@ -139,7 +139,7 @@ def test_a_sky_is_learned_outside_the_box(room):
     def sky_alone(views: Views) -> Views:
         rays = [camera_rays(p, k, 32, 32) for p, k in zip(views.poses, views.intrinsics, strict=True)]
         rgb = torch.stack([sky(one.directions).reshape(32, 32, 3) for one in rays])
-        return replace(views, rgba=torch.cat([rgb, torch.ones_like(rgb[..., :1])], dim=-1))
+        return replace(views, pixels=torch.cat([rgb, torch.ones_like(rgb[..., :1])], dim=-1))
 
     empty = replace(room, train=sky_alone(room.train), test=sky_alone(room.test))
     scores = {}

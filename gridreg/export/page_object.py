@@ -79,8 +79,9 @@ def photographs_of(views: Views, background: torch.Tensor) -> list[tuple[str, st
     chosen = _chosen(views)
     found = []
     for i in chosen:
-        alpha = views.rgba[i, ..., 3:]
-        image = views.rgba[i, ..., :3] * alpha + background * (1 - alpha)
+        rgba = views.image(i)
+        alpha = rgba[..., 3:]
+        image = rgba[..., :3] * alpha + background * (1 - alpha)
         small = Image.fromarray((image * 255).round().to(torch.uint8).cpu().numpy())
         small.thumbnail((_THUMBNAIL, _THUMBNAIL))
         found.append((views.names[i], data_uri(small, "jpeg")))

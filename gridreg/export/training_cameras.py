@@ -74,7 +74,7 @@ class TrainingCameras:
         rendered = model.render(Camera(views.poses[number], lens), stop=stop)
         if rendered is None:
             return None
-        rgba = views.rgba[number].permute(2, 0, 1)[None]
+        rgba = views.image(number).permute(2, 0, 1)[None]
         # Colours weigh as much as they cover, so they are averaged on their background.
         alpha, behind = rgba[:, 3:], self._background.to(rgba).view(1, 3, 1, 1)
         seen = F.interpolate(

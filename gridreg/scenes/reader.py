@@ -20,6 +20,7 @@ from gridreg.scenes.frames import Frame, SceneFiles
 from gridreg.scenes.gate import check_cameras
 from gridreg.scenes.images import area_mean, fit_mask
 from gridreg.scenes.lens import undistort
+from gridreg.scenes.pixels import as_bytes, as_floats
 from gridreg.scenes.protocols import Protocol
 from gridreg.scenes.views import Views, World
 
@@ -34,7 +35,7 @@ class OpenedFrames:
     """Frames with their images, in the world of their files.
 
     Attributes:
-        rgba: ``(V, H, W, 4)`` float32.
+        pixels: ``(V, H, W, 4)``, see `Views`.
         poses: ``(V, 4, 4)`` float64 camera-to-world.
         intrinsics: ``(V, 4)`` float64, of these images.
         names: ``V`` names fit for file names.
@@ -42,7 +43,7 @@ class OpenedFrames:
         fingerprint: hash of pixels and cameras.
     """
 
-    rgba: Tensor
+    pixels: Tensor
     poses: NDArray[np.float64]
     intrinsics: NDArray[np.float64]
     names: tuple[str, ...]
@@ -52,13 +53,13 @@ class OpenedFrames:
     @property
     def size(self) -> tuple[int, int]:
         """Width and height in pixels."""
-        return int(self.rgba.shape[2]), int(self.rgba.shape[1])
+        return int(self.pixels.shape[2]), int(self.pixels.shape[1])
 
     def views(self, world: World) -> Views:
         """Return the views in the coordinates of the scene."""
         poses = torch.tensor(world.inward(self.poses), dtype=torch.float32)
         intrinsics = torch.tensor(self.intrinsics, dtype=torch.float32)
-        return Views(self.rgba, poses, intrinsics, self.names, self.ids)
+        return Views(self.pixels, poses, intrinsics, self.names, self.ids)
 
 
 class ViewReader:
@@ -103,17 +104,21 @@ class ViewReader:
                 have it.
         """
         digest = hashlib.sha256()
-        rgba = torch.empty(0, *self._reduced, 4)
+        pixels = torch.empty(0, *self._reduced, 4)
         intrinsics = np.zeros((len(ids), 4))
         paths: list[Path] = []
         for k, i in enumerate(ids):
             path = resolve_inside(self._files.folder, frames[i].file_path, frames[i].where)
             digest.update(f"{i} {frames[i].camera.fingerprint}".encode() + frames[i].pose.tobytes())
             image, intrinsics[k] = self._read_frame(path, frames[i], digest)
+            levels = as_bytes(image) if not k or pixels.dtype == torch.uint8 else None
             if not k:
                 # One tensor from the first on: a list that is joined at the end takes twice the memory.
-                rgba, self._reduced = torch.empty(len(ids), *image.shape), image.shape[:2]
-            rgba[k] = torch.from_numpy(image)
+                kind = torch.float32 if levels is None else torch.uint8
+                pixels, self._reduced = torch.empty(len(ids), *image.shape, dtype=kind), image.shape[:2]
+            elif levels is None:
+                pixels = as_floats(pixels)
+            pixels[k] = torch.from_numpy(image if levels is None else levels)
             if path in paths:
                 raise InputError(
                     f"{frames[i].where}: names {path.name}, as another frame does; expected an image each"
@@ -121,9 +126,9 @@ class ViewReader:
             paths.append(path)
         wheres = [f"{frames[i].where} ({path.name})" for i, path in zip(ids, paths, strict=True)]
         poses = np.array([frames[i].pose for i in ids]).reshape(-1, 4, 4)
-        check_cameras(poses, intrinsics.astype(np.float32), (rgba.shape[2], rgba.shape[1]), wheres)
+        check_cameras(poses, intrinsics.astype(np.float32), (pixels.shape[2], pixels.shape[1]), wheres)
         names = _unique_names(self._files.folder, paths)
-        return OpenedFrames(rgba, poses, intrinsics, names, ids, digest.hexdigest())
+        return OpenedFrames(pixels, poses, intrinsics, names, ids, digest.hexdigest())
 
     def _read_frame(
         self, path: Path, frame: Frame, digest: hashlib._Hash

@@ -15,6 +15,7 @@ from torch import Tensor
 from gridreg.errors import InputError
 from gridreg.scenes.gate import check_cameras, check_extent
 from gridreg.scenes.notebook import card, thumbnails
+from gridreg.scenes.pixels import as_floats
 from gridreg.scenes.silhouettes import silhouettes
 
 __all__ = ["IN_PLACE", "Scene", "Views", "World", "background_colour"]
@@ -93,23 +94,26 @@ class Views:
     """Images of one size with their cameras.
 
     Attributes:
-        rgba: ``(V, H, W, 4)`` float32 in [0, 1], straight (not premultiplied) alpha.
+        pixels: ``(V, H, W, 4)`` straight (not premultiplied) alpha; float32 in [0, 1], or uint8 where every value
+            is a whole number of 255ths, which takes a quarter of the memory.
         poses: ``(V, 4, 4)`` float32 camera-to-world matrices, camera looking along its -z, y up.
         intrinsics: ``(V, 4)`` float32: fx, fy, cx, cy in pixels of these images.
         names: ``V`` names fit for file names, one of a kind.
         ids: ``V`` indices into the frame list of the file that the views were selected from.
     """
 
-    rgba: Tensor
+    pixels: Tensor
     poses: Tensor
     intrinsics: Tensor
     names: tuple[str, ...]
     ids: tuple[int, ...]
 
     def __post_init__(self) -> None:
-        count = self.rgba.shape[0]
-        if self.rgba.ndim != 4 or self.rgba.shape[-1] != 4:
-            raise InputError(f"rgba: found shape {tuple(self.rgba.shape)}, expected (V, H, W, 4)")
+        count = self.pixels.shape[0]
+        if self.pixels.ndim != 4 or self.pixels.shape[-1] != 4:
+            raise InputError(f"pixels: found shape {tuple(self.pixels.shape)}, expected (V, H, W, 4)")
+        if self.pixels.dtype not in (torch.float32, torch.uint8):
+            raise InputError(f"pixels: found {self.pixels.dtype}, expected float32 in [0, 1] or uint8")
         if tuple(self.poses.shape) != (count, 4, 4):
             raise InputError(f"poses: found shape {tuple(self.poses.shape)}, expected ({count}, 4, 4)")
         if tuple(self.intrinsics.shape) != (count, 4):
@@ -122,7 +126,7 @@ class Views:
         check_cameras(self.poses.cpu(), self.intrinsics.cpu(), (self.width, self.height), called)
 
     def __len__(self) -> int:
-        return int(self.rgba.shape[0])
+        return int(self.pixels.shape[0])
 
     def __repr__(self) -> str:
         return f"Views({len(self)} of {self.width}x{self.height})"
@@ -130,12 +134,26 @@ class Views:
     @property
     def height(self) -> int:
         """Rows of every image."""
-        return int(self.rgba.shape[1])
+        return int(self.pixels.shape[1])
 
     @property
     def width(self) -> int:
         """Columns of every image."""
-        return int(self.rgba.shape[2])
+        return int(self.pixels.shape[2])
+
+    @property
+    def rgba(self) -> Tensor:
+        """All pixels as ``(V, H, W, 4)`` float32: a copy of all of them if they are stored as bytes."""
+        return as_floats(self.pixels)
+
+    def image(self, number: int) -> Tensor:
+        """Return one image, ``(H, W, 4)`` float32."""
+        return as_floats(self.pixels[number])
+
+    @property
+    def _opaque(self) -> bool:
+        top = 1 if self.pixels.is_floating_point() else 255
+        return not bool((self.pixels[..., 3] < top).any())
 
     @functools.cached_property
     def backdrop(self) -> Tensor | None:
@@ -150,7 +168,7 @@ class Views:
             >>> views.backdrop.tolist()
             [1.0, 1.0, 1.0]
         """
-        if not len(self) or bool((self.rgba[..., 3] < 1).any()):
+        if not len(self) or not self._opaque:
             return None
         pixels = self._frame
         colour = pixels.median(dim=0).values
@@ -160,15 +178,15 @@ class Views:
     @property
     def shows_room(self) -> bool:
         """Whether there is something behind the object: images are opaque, and not before a `backdrop`."""
-        return self.backdrop is None and not bool((self.rgba[..., 3] < 1).any())
+        return self.backdrop is None and self._opaque
 
     @property
     def _frame(self) -> Tensor:
         """Colours ``(N, 3)`` along the edges of all images."""
         edge = max(1, round(_FRAME * min(self.height, self.width)))
-        rgb = self.rgba[..., :3]
+        rgb = self.pixels[..., :3]
         sides = rgb[:, :edge], rgb[:, -edge:], rgb[:, :, :edge], rgb[:, :, -edge:]
-        return torch.cat([side.reshape(-1, 3) for side in sides])
+        return as_floats(torch.cat([side.reshape(-1, 3) for side in sides]))
 
     @functools.cached_property
     def silhouettes(self) -> Tensor:
@@ -177,16 +195,17 @@ class Views:
         NaN where they do not, see `gridreg.scenes.silhouettes`.
         """
         if self.backdrop is None:
-            return self.rgba[..., 3]
+            return as_floats(self.pixels[..., 3])
         off = (self._frame - self.backdrop).abs().amax(dim=-1)
-        return silhouettes(self.rgba[..., :3], self.backdrop, off[off < _CLOSE])
+        return silhouettes(as_floats(self.pixels[..., :3]), self.backdrop, off[off < _CLOSE])
 
     @property
     def plain(self) -> list[str]:
         """Names of the images that show nothing but one colour."""
         found = []
         # One image after the other: copies of all of them would take as much memory as they do.
-        for name, rgba in zip(self.names, self.rgba, strict=True):
+        for name, stored in zip(self.names, self.pixels, strict=True):
+            rgba = as_floats(stored)
             alpha = rgba[..., 3:]
             pixels = torch.cat([rgba[..., :3] * alpha, alpha], dim=-1).flatten(0, 1)
             if bool((pixels.amax(dim=0) - pixels.amin(dim=0)).amax() < 1 / 255):
@@ -202,16 +221,17 @@ class Views:
         Returns:
             ``(V, H, W, 3)`` float32: ``alpha * rgb + (1 - alpha) * background``.
         """
-        colour = background_colour(background).to(self.rgba.device)
-        composited = self.rgba.new_empty((*self.rgba.shape[:3], 3))
-        for rgba, target in zip(self.rgba, composited, strict=True):
+        colour = background_colour(background).to(self.pixels.device)
+        composited = colour.new_empty((*self.pixels.shape[:3], 3))
+        for stored, target in zip(self.pixels, composited, strict=True):
+            rgba = as_floats(stored)
             target.copy_(rgba[..., :3] * rgba[..., 3:] + colour * (1 - rgba[..., 3:]))
         return composited
 
     def to(self, device: torch.device | str) -> Views:
         """Return the same views with their tensors on ``device``."""
         return Views(
-            self.rgba.to(device), self.poses.to(device), self.intrinsics.to(device), self.names, self.ids
+            self.pixels.to(device), self.poses.to(device), self.intrinsics.to(device), self.names, self.ids
         )
 
 

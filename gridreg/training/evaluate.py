@@ -67,7 +67,7 @@ def mean_psnr_of(model: Model, views: Views, stride: int = 1) -> float:
     """Mean PSNR (dB) over every ``stride``-th view, for a look on the way."""
     chosen = slice(None, None, stride)
     some = Views(
-        views.rgba[chosen],
+        views.pixels[chosen],
         views.poses[chosen],
         views.intrinsics[chosen],
         views.names[chosen],

@@ -13,6 +13,7 @@ from gridreg.attach.handle import Handle
 from gridreg.errors import InputError
 from gridreg.rendering import OccupancyGrid, Rays, box_intersection, pixel_rays
 from gridreg.scenes import Scene, Views, ndc_rays
+from gridreg.scenes.pixels import as_floats
 
 __all__ = ["Batch", "NdcWarp", "RayBank", "behind", "known_alpha", "meets", "warp_of"]
 
@@ -125,10 +126,15 @@ class RayBank:
         alpha: Tensor | None = None,
     ) -> None:
         self.views, self.warp, self.reshuffle = views, warp, reshuffle
-        self.count, self.height, self.width = views.rgba.shape[:3]
-        rgba = views.rgba if alpha is None else torch.cat([views.rgba[..., :3], alpha[..., None]], dim=-1)
-        self.pixels = rgba.reshape(-1, 4)
-        self.active = torch.arange(self.pixels.shape[0], device=self.pixels.device)
+        self.count, self.height, self.width = views.pixels.shape[:3]
+        pixels = views.pixels
+        if alpha is not None:
+            pixels = torch.cat([as_floats(pixels[..., :3]), alpha[..., None]], dim=-1)
+        self.pixels = pixels.reshape(-1, 4)
+        count = self.pixels.shape[0]
+        # Half of the memory while they can be counted so.
+        kind = torch.int32 if count < 2**31 else torch.int64
+        self.active = torch.arange(count, dtype=kind, device=self.pixels.device)
         self.waiting = self.active[:0]
         self.drawn = self.active[:0]
 
@@ -157,8 +163,8 @@ class RayBank:
         else:
             chosen = torch.randint(self.active.shape[0], (count,), generator=generator)
             index = self.active[chosen.to(self.active.device)]
-        self.drawn = index
-        return self.rays(index), self.pixels[index]
+        self.drawn = index.long()
+        return self.rays(self.drawn), as_floats(self.pixels[self.drawn])
 
     @property
     def drawn_views(self) -> Tensor:
@@ -176,8 +182,8 @@ class RayBank:
     def restrict(self, useful: Callable[[Rays], Tensor], chunk: int = 1 << 15) -> None:
         """Keep the active pixels whose ray is useful, and all that are not transparent."""
         parts = torch.split(self.active, chunk)
-        kept = [part[useful(self.rays(part)) | (self.pixels[part, 3] != 0)] for part in parts]
-        self.active = torch.cat(kept)
+        kept = [useful(self.rays(part.long())) | (self.pixels[part.long(), 3] != 0) for part in parts]
+        self.active = self.active[torch.cat(kept)]
         self.waiting = self.active[:0]
 
 
