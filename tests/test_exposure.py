@@ -88,7 +88,9 @@ def test_wanted_where_it_is_said(scene):
     assert not wants_exposure(scene, TrainSettings())
     one = replace(
         scene.train,
-        **{name: getattr(scene.train, name)[:1] for name in ("pixels", "poses", "intrinsics", "names", "ids")},
+        **{
+            name: getattr(scene.train, name)[:1] for name in ("pixels", "poses", "intrinsics", "names", "ids")
+        },
     )
     assert not wants_exposure(replace(scene, train=one), CONFIG.train)
 
