@@ -224,7 +224,7 @@ def main() -> int:
             scratch = arguments.keep
             scratch.mkdir(parents=True)
         figures = (run_on_sheet if arguments.sheet else run)(arguments, scratch)
-    print(f"registered {figures['registered']} of {figures['pictures']} photographs")
+    print(f"registered {figures['registered']} of {arguments.photographs} photographs")
     if arguments.cameras_only:
         return 0
     print(
