@@ -195,7 +195,11 @@ def main() -> int:
         most = BOUNDS[name]
         kept = status == 0 and seconds <= most[0] and megabytes <= most[1]
         missed += not kept
-        record = {"seconds": round(seconds, 1), "wall_seconds": round(wall, 1), "megabytes": round(megabytes)}
+        record = {
+            "seconds": round(seconds, 1),
+            "wall_seconds": round(wall, 1),
+            "megabytes": max(0, round(megabytes)),
+        }
         bound = {"most_seconds": most[0], "most_megabytes": most[1], "kept": kept}
         stored.save("load", name, record | more | bound | {"versions": versions()}, options.results)
         print(f"{name}: {json.dumps(record | more | bound)}", flush=True)

@@ -50,20 +50,23 @@ def polygonise(
         Vertices ``(V, 3)`` in world units and faces ``(F, 3)``, counterclockwise seen from outside; both
         empty when no node is above the threshold.
     """
-    values = np.pad(volume.values, 1)
-    solid = values >= threshold
+    # In place and in this order: at 512 nodes along an edge every copy of the lattice is half a GB.
+    solid = np.pad(volume.values >= threshold, 1)
     if not solid.any():
         return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
-    level = values / (values + np.float32(threshold))
-    # A node right on the level would give several vertices in one place.
-    level = np.where(solid, np.maximum(level, 0.5 + _MARGIN), np.minimum(level, 0.5 - _MARGIN))
-    if fill_cavities:
-        air, _ = ndimage.label(~solid)
-        level[(air != air[0, 0, 0]) & ~solid] = 1.0
+    cavities = _cavities(solid) if fill_cavities else None
+    level = np.pad(volume.values, 1)
+    for layer, within in zip(level, solid, strict=True):
+        layer /= layer + np.float32(threshold)
+        # A node right on the level would give several vertices in one place.
+        layer[within] = np.maximum(layer[within], 0.5 + _MARGIN)
+        layer[~within] = np.minimum(layer[~within], 0.5 - _MARGIN)
+    if cavities is not None:
+        level[cavities] = 1.0
+        del cavities
     # scikit-image calls outward faces of solids with large values "ascent".
-    found, faces, _, _ = marching_cubes(  # type: ignore[no-untyped-call]
-        level.astype(np.float32), 0.5, gradient_direction="ascent"
-    )
+    found, faces, _, _ = marching_cubes(level, 0.5, gradient_direction="ascent")  # type: ignore[no-untyped-call]
+    del level
     index = found.astype(np.float64)
     if density is not None and refine > 0:
         index = _on_level(
@@ -72,6 +75,14 @@ def polygonise(
     # The empty layer is a device: the surface itself ends at the box.
     index = np.clip(index - 1, 0, np.array(volume.values.shape) - 1)
     return volume.lower + index * volume.spacing, faces.astype(np.int64)
+
+
+def _cavities(solid: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return the empty nodes that cannot be reached from the first one, which is empty."""
+    air, _ = ndimage.label(~solid)
+    unreached: NDArray[np.bool_] = air != air[0, 0, 0]
+    unreached &= ~solid
+    return unreached
 
 
 def _on_level(

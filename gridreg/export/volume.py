@@ -140,7 +140,8 @@ def surface_threshold(volume: DensityVolume) -> float:
         forwards = np.moveaxis(volume.values, axis, 0)
         largest.append(forwards.max(axis=0).ravel())
         for along in (forwards, forwards[::-1]):
-            depth = np.cumsum(along, axis=0, dtype=np.float32) * np.float32(volume.spacing[axis])
+            depth = np.cumsum(along, axis=0, dtype=np.float32)
+            depth *= np.float32(volume.spacing[axis])
             opaque = depth[-1] >= half
             first = np.argmax(depth >= half, axis=0)
             taking.append(np.take_along_axis(along, first[None], axis=0)[0][opaque])
