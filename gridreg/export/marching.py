@@ -79,10 +79,11 @@ def polygonise(
 
 def _cavities(solid: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return the empty nodes that cannot be reached from the first one, which is empty."""
-    air, _ = ndimage.label(~solid)
-    unreached: NDArray[np.bool_] = air != air[0, 0, 0]
-    unreached &= ~solid
-    return unreached
+    empty: NDArray[np.bool_] = ~solid
+    labels, _ = ndimage.label(empty)
+    for layer, labelled in zip(empty, labels, strict=True):
+        layer &= labelled != labels[0, 0, 0]
+    return empty
 
 
 def _on_level(
