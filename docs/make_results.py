@@ -1,6 +1,6 @@
-"""Write docs/results.md and the table in README.md from the figures stored in benchmarks/results.
+"""Write docs/results.md and tables of README.md and docs/photographs.md from the figures in benchmarks/results.
 
-python docs/make_results.py            write both
+python docs/make_results.py            write them
 python docs/make_results.py --check    exit with status 1 if one is stale
 
 The page's words stand in docs/results.md.jinja, the rows of its tables in docs/results.yaml.
@@ -17,12 +17,14 @@ import jinja2
 sys.path.insert(0, str(Path(__file__).parent))
 import results_foreign
 from generated import write_or_check
-from results_tables import Results
+from results_tables import RESULTS, Results, load, psnr, table
 
 TEMPLATE = Path(__file__).with_name("results.md.jinja")
 PAGE, README = Path(__file__).with_name("results.md"), Path(__file__).parents[1] / "README.md"
 BEGIN, END = "<!-- results: begin -->", "<!-- results: end -->"
 FOREIGN = "<!-- foreign: begin -->", "<!-- foreign: end -->"
+PHOTOGRAPHS = Path(__file__).with_name("photographs.md")
+SHEET = "<!-- sheet: begin -->", "<!-- sheet: end -->"
 
 
 def page(results: Results) -> str:
@@ -38,13 +40,30 @@ def with_front(readme: str, front: str) -> str:
     return between(readme, f"\n{front}\n", BEGIN, END)
 
 
-def between(readme: str, text: str, first: str, last: str) -> str:
-    """Return README.md with what is between two marks renewed."""
-    before, begin, rest = readme.partition(first)
+def between(page: str, text: str, first: str, last: str) -> str:
+    """Return a page with what is between two marks renewed."""
+    before, begin, rest = page.partition(first)
     _, end, after = rest.partition(last)
     if not begin or not end:
-        raise ValueError(f"README.md: found no table between {first!r} and {last!r}")
+        raise ValueError(f"found no table between {first!r} and {last!r}")
     return f"{before}{begin}{text}{end}{after}"
+
+
+def sheet(folder: Path = RESULTS) -> str:
+    """Return what ``gridreg reconstruct`` makes of the built-in photographs, measured against the truth."""
+    (one,) = [r for r in load("own_photographs", folder) if r["name"].startswith("sheet-8x")]
+    cameras, masks, mesh = one["camera_errors"], one["mask_overlap"], one["mesh"]
+    rows = [
+        ("the one command, minutes", f"{one['seconds']['wall'] / 60:.1f}"),
+        ("cameras, largest error of direction, degrees", f"{cameras['rotation_degrees_max']:.3f}"),
+        ("cameras, largest error of place, % of the distance", f"{cameras['position_percent_max']:.3f}"),
+        ("masks, intersection over union, mean and worst", f"{masks['mean']:.3f}, {masks['least']:.3f}"),
+        ("mesh, Chamfer distance, % of the diagonal", f"{mesh['chamfer_percent']:.2f}"),
+        ("mesh, error of the height, %", f"{mesh['size_percent']:+.1f}"),
+        ("views that were not learned from, dB", f"{psnr(one['estimated']):.2f}"),
+        ("the same with true cameras and masks, dB", f"{psnr(one['true']):.2f}"),
+    ]
+    return f"\n{table(('', 'measured'), rows)}\n"
 
 
 def main(words: Sequence[str] | None = None) -> int:
@@ -53,7 +72,9 @@ def main(words: Sequence[str] | None = None) -> int:
     def texts() -> dict[Path, str]:
         results = Results()
         readme = with_front(README.read_text(encoding="utf-8"), results.front())
-        return {PAGE: page(results), README: between(readme, results_foreign.sentence(), *FOREIGN)}
+        photographs = between(PHOTOGRAPHS.read_text(encoding="utf-8"), sheet(), *SHEET)
+        front = between(readme, results_foreign.sentence(), *FOREIGN)
+        return {PAGE: page(results), README: front, PHOTOGRAPHS: photographs}
 
     return write_or_check(words, "make_results.py", texts)
 
