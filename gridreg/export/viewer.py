@@ -259,7 +259,8 @@ class Viewer:
         start = time.monotonic()
         # A first image is always finished: something must be seen during a long movement.
         rendered = self._render(camera, look, None if first else screen, wanted)
-        if rendered is None:
+        # Nor to a browser that went away meanwhile: viser would warn of it in the terminal.
+        if rendered is None or screen.client.client_id not in self._screens:
             return
         self._pace.saw(camera.lens.height * camera.lens.width, time.monotonic() - start)
         pixels, note = composed(rendered, look)
