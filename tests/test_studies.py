@@ -125,6 +125,7 @@ ROWS = {
         "grids 0.02, network 0.001", "grids 0.04, network 0.001", "grids 0.08, network 0.001",
         "grids 0.04, network 0.003", "grids 0.04, distortion 0.01", "grids 0.06, network 0.002, distortion 0.003",
     ],
+    "builtin_pieces": ["quick", "no masks", "no total variation", "no random backgrounds"],
     "smoke": ["no masks", "quick", "quick - RandomBackground"],
 }  # fmt: skip
 
