@@ -254,14 +254,14 @@ def main() -> int:
     parser.add_argument("--results", type=Path, default=stored.RESULTS)
     options = parser.parse_args()
     torch.set_num_threads(1)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # Under nohup it is ignored, and a run rightly leaves it so.
     faults = 0
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         os.chdir(folder)
         scene = small_scene(folder)
         (folder / "study.yaml").write_text(STUDY)
-        places = [folder / "train", folder / "study"]
-        for place in places:
+        for place in (places := [folder / "train", folder / "study"]):
             place.mkdir()
         train = Trial("train", places[0], lambda out: train_command(out, scene), end_of_run)
         parts: dict[str, Callable[[Keep], dict[str, Any]]] = {
