@@ -246,7 +246,7 @@ def test_commands_of_the_page_are_accepted():
     (block,) = titled("bash", "run")
     for line in block.strip().splitlines():
         program, example, *words = shlex.split(line)
-        assert (program, example) == (".venv/bin/python", "examples/ablation.py")
+        assert (program, example) == (".venv/bin/gridreg", "ablate")
         found = tyro.cli(AblationOptions, args=words)
         assert found.study == Path("study.yaml")
 

@@ -392,7 +392,7 @@ def test_names_are_escaped_where_they_are_printed(capsys: pytest.CaptureFixture[
         ),
         (["train", "--steps", "abc"], "--steps"),
         (["eval"], "RUN"),
-        (["render", "run", "--modes", "rbg"], "Expected one of ('rgb', 'depth', 'opacity')"),
+        (["render", "run", "--modes", "rbg"], "Expected one of ('rgb', 'depth', 'opacity', 'deviation')"),
     ],
 )
 def test_a_wrong_option_is_one_line(

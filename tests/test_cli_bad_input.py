@@ -99,13 +99,6 @@ def test_no_folder_and_no_pictures(refused: Refused, tmp_path: Path) -> None:
     assert "found 3 images, expected at least 4" in refused("prepare", "pictures", "out")
 
 
-def test_pictures_of_different_sizes(refused: Refused, tmp_path: Path) -> None:
-    for k in range(5):
-        picture(tmp_path / f"pictures/{k}.png", (32, 24) if k != 3 else (24, 32))
-    line = refused("prepare", "pictures", "out")
-    assert "3.png: image is 24x32 upright, expected 32x24 as 0.png" in line
-
-
 def test_pictures_of_different_sizes_with_one_intrinsics(refused: Refused, tmp_path: Path) -> None:
     posed_pictures(tmp_path / "scene", back=False)
     picture(tmp_path / "scene/images/3.png", (40, 24))

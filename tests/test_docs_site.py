@@ -77,8 +77,8 @@ def test_pages_show_every_diagram_with_a_description() -> None:
         for text, target in re.findall(r"!\[(.*?)\]\((.*?)\)", path.read_text(encoding="utf-8")):
             assert len(text.split()) >= 5, f"{path.name}: {target} needs a description"
             shown.add((path.parent / target).resolve())
-    images = (DOCS / "images").resolve().glob("*.webp")
-    assert shown == {*(DOCS / "diagrams").resolve().glob("*.svg"), *images}
+    files = [("diagrams", "*.svg"), ("images", "*.webp"), ("photographs", "*.jpg")]
+    assert shown == {path for folder, kind in files for path in (DOCS / folder).resolve().glob(kind)}
 
 
 # --- the site's own code

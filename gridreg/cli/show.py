@@ -21,9 +21,12 @@ class ShowOptions:
     """List what there is to choose, or show one of it: a preset's file, a protocol's views, a regularizer's formula."""
 
     kind: Annotated[
-        Literal["presets", "compositions", "protocols", "regularizers", "config"], tyro.conf.Positional
+        Literal["presets", "compositions", "protocols", "regularizers", "config"],
+        tyro.conf.Positional,
+        tyro.conf.arg(metavar="KIND"),
     ]
-    """What to list; `config`: the keys of a configuration with their defaults."""
+    """What to list: presets, compositions, protocols, regularizers, or config, the keys of a configuration with their
+    defaults."""
     name: Annotated[
         str | None, tyro.conf.Positional, tyro.conf.arg(metavar="NAME", help_behavior_hint="")
     ] = None
