@@ -74,7 +74,10 @@ class TestImages:
             "print('noise'); print('features'); print('matches'); print('cameras'); print('registered', len(names))\n"
         )
         monkeypatch.setattr(worker, "__file__", str(script))
-        monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
+        found = importlib.util.find_spec
+        monkeypatch.setattr(
+            importlib.util, "find_spec", lambda name: object() if name == "pycolmap" else found(name)
+        )
         return script
 
     def test_become_a_scene(self, images: Path, stand_in: Path, tmp_path: Path, source: Path) -> None:
