@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from gridreg.ablation.edits import Plain, normalised
+from gridreg.ablation.statistics import standard_error
 
 __all__ = ["ADDITIONS", "FACTORS", "FEWEST", "START", "Gain", "Outcome", "candidates", "chosen", "race"]
 
@@ -47,10 +48,12 @@ class Gain:
     @property
     def error(self) -> float:
         """Standard error of the mean; infinite below two views."""
-        count = len(self.values)
-        if count < 2:
-            return math.inf
-        return math.sqrt(math.fsum((v - self.mean) ** 2 for v in self.values) / (count - 1) / count)
+        return standard_error(self.values, self.mean) if len(self.values) > 1 else math.inf
+
+    @property
+    def holds(self) -> bool:
+        """Whether it was measured on enough views and exceeds its standard error."""
+        return len(self.values) >= FEWEST and self.mean > self.error
 
 
 @dataclass(frozen=True)
@@ -98,8 +101,7 @@ def candidates(plain: Plain) -> dict[str, Plain]:
 
 def chosen(gains: Sequence[Gain]) -> Gain | None:
     """Return the variation with the best gain less its standard error, if that is above zero, else None."""
-    fit = [gain for gain in gains if len(gain.values) >= FEWEST and gain.mean > gain.error]
-    return max(fit, key=lambda gain: gain.mean - gain.error, default=None)
+    return max((gain for gain in gains if gain.holds), key=lambda gain: gain.mean - gain.error, default=None)
 
 
 def race(plain: Plain, views: int, trial: Trial, affordable: Callable[[int], int]) -> Outcome:
@@ -144,7 +146,7 @@ def race(plain: Plain, views: int, trial: Trial, affordable: Callable[[int], int
         alive = [START, *(gain.label for gain in raced)]
     best: dict[str, str] = {}
     for gain in sorted(gains(), key=lambda g: g.mean - g.error):
-        if len(gain.values) == done >= FEWEST and gain.mean > gain.error:
+        if len(gain.values) == done and gain.holds:
             best[gain.label.partition(" ")[0]] = gain.label
     if len(best) > 1:
         together, everything = " and ".join(best.values()), plain

@@ -16,7 +16,16 @@ from scipy.special import stdtr, stdtrit  # type: ignore[import-untyped]
 
 from gridreg.errors import InputError
 
-__all__ = ["Cell", "Difference", "Estimate", "Verdict", "estimate", "holm", "paired_differences"]
+__all__ = [
+    "Cell",
+    "Difference",
+    "Estimate",
+    "Verdict",
+    "estimate",
+    "holm",
+    "paired_differences",
+    "standard_error",
+]
 
 Verdict = Literal["higher", "lower", "within noise", "one pair", "no pair"]
 
@@ -122,7 +131,7 @@ def estimate(values: Iterable[float], confidence: float = 0.95) -> Estimate:
     if count == 1:
         return Estimate(mean, None, 1)
     return Estimate(
-        mean, float(stdtrit(count - 1, (1 + confidence) / 2)) * _standard_error(sample, mean), count
+        mean, float(stdtrit(count - 1, (1 + confidence) / 2)) * standard_error(sample, mean), count
     )
 
 
@@ -188,7 +197,8 @@ def holm(p_values: Sequence[float]) -> list[float]:
     return adjusted
 
 
-def _standard_error(sample: Sequence[float], mean: float) -> float:
+def standard_error(sample: Sequence[float], mean: float) -> float:
+    """Standard error of the mean of a sample of at least two."""
     count = len(sample)
     return math.sqrt(math.fsum((value - mean) ** 2 for value in sample) / (count - 1) / count)
 
@@ -197,7 +207,7 @@ def _p_value(sample: Sequence[float]) -> float | None:
     if len(sample) < 2:
         return None
     mean = math.fsum(sample) / len(sample)
-    error = _standard_error(sample, mean)
+    error = standard_error(sample, mean)
     if error == 0:
         return 0.0 if mean else 1.0
     return float(2 * stdtr(len(sample) - 1, -abs(mean / error)))
