@@ -189,7 +189,7 @@ def _pairs(folder: Path, record: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 def _doubts(model: Model | None, scene: Scene | None) -> list[tuple[str, str]]:
     """Renders of an ensemble from four sides, each beside how far its members differ."""
-    if scene is None or not getattr(model, "members", ()) or model is None or model.warp is not None:
+    if scene is None or model is None or not model.members or model.warp is not None:
         return []
     orbit = orbit_of_views(scene.train, scene.bounds)
     lens = Lens.from_tensor(scene.train.intrinsics[0], scene.train.height, scene.train.width)

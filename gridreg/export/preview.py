@@ -59,11 +59,7 @@ class Preview:
     @property
     def modes(self) -> tuple[str, ...]:
         """Those of `gridreg.export.images.MODES` that it has: an ensemble alone has a deviation."""
-        return (
-            MODES
-            if getattr(self._model, "members", ())
-            else tuple(mode for mode in MODES if mode != "deviation")
-        )
+        return MODES if self._model.members else tuple(mode for mode in MODES if mode != "deviation")
 
     @property
     def warped(self) -> bool:

@@ -12,6 +12,7 @@ from torch import Tensor
 from gridreg.attach.handle import Handle
 from gridreg.errors import InputError
 from gridreg.rendering.cameras import Camera
+from gridreg.rendering.ensemble import deviation_of
 from gridreg.rendering.occupancy import OccupancyGrid
 from gridreg.rendering.rays import Rays, camera_rays
 from gridreg.rendering.render import MarchSettings, Rendered, render_rays
@@ -38,6 +39,7 @@ class Model:
             (`gridreg.scenes.ndc_rays`) for forward-facing scenes; distances are then those of the mapped
             rays. None: they are the world's.
         surroundings: what is outside the field's box, instead of the background; None: nothing.
+        members: the models that an ensemble is made of, else none.
     """
 
     field: Any
@@ -47,6 +49,7 @@ class Model:
     handle: Handle | None = None
     warp: Callable[[Rays], Rays] | None = None
     surroundings: Surroundings | JoinedSurroundings | None = None
+    members: tuple[Model, ...] = ()
 
     @classmethod
     def of_field(cls, field: Any, *, resolution: int = 256, background: Tensor | None = None) -> Model:
@@ -88,7 +91,7 @@ class Model:
         Raises:
             InputError: for the deviation of what is no ensemble.
         """
-        if deviation:
+        if deviation and not self.members:
             raise InputError("deviation: found one run, expected an ensemble (gridreg ensemble RUN RUN ...)")
         device = self.field.bounds.device
         lens = camera.lens
@@ -101,11 +104,19 @@ class Model:
             if stop is not None and stop():
                 return None
             parts.append(self._render(rays[start : start + chunk]))
+        apart = None
+        if deviation:
+            images = [member.render(camera, chunk=chunk, stop=stop) for member in self.members]
+            colours = [image.colour for image in images if image is not None]
+            if len(colours) < len(images):
+                return None
+            apart = deviation_of(torch.stack(colours))
         shape = (lens.height, lens.width)
         return Rendered(
             torch.cat([p.colour for p in parts]).clamp(0, 1).reshape(*shape, 3),
             torch.cat([p.opacity for p in parts]).reshape(shape),
             torch.cat([p.depth for p in parts]).reshape(shape),
+            deviation=apart,
         )
 
     def _render(self, rays: Rays) -> Rendered:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,15 +14,12 @@ import gridreg
 from gridreg.errors import InputError
 from gridreg.fields import import_modules, make_field
 from gridreg.rendering import (
-    Camera,
     Ensemble,
     JoinedSurroundings,
     Model,
     OccupancyGrid,
-    Rendered,
     Surroundings,
 )
-from gridreg.rendering.ensemble import deviation_of
 from gridreg.scenes import IN_PLACE, World
 from gridreg.scenes.gate import check_extent
 from gridreg.scenes.notebook import card
@@ -70,24 +67,6 @@ class LoadedRun(Model):
     def _repr_html_(self) -> str:
         """The run as notebooks show it, with the table of its regularizers."""
         return card(repr(self), "") + ("" if self.handle is None else self.handle._repr_html_())
-
-    def render(
-        self,
-        camera: Camera,
-        *,
-        chunk: int = 1 << 13,
-        stop: Callable[[], bool] | None = None,
-        deviation: bool = False,
-    ) -> Rendered | None:
-        """An image, see `gridreg.rendering.Model.render`; of an ensemble, with the deviation of its members."""
-        found = super().render(camera, chunk=chunk, stop=stop, deviation=deviation and not self.members)
-        if found is None or not deviation:
-            return found
-        images = [member.render(camera, chunk=chunk, stop=stop) for member in self.members]
-        colours = [image.colour for image in images if image is not None]
-        if len(colours) < len(images):
-            return None
-        return replace(found, deviation=deviation_of(torch.stack(colours)))
 
 
 def checkpoint_of(folder: str | Path) -> Path:
