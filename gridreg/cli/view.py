@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gridreg.cli.arguments import Checkpoint, OptionalFolder
+from gridreg.errors import InputError
 from gridreg.machine import DeviceName, choose_device
 
 if TYPE_CHECKING:
@@ -72,15 +73,15 @@ def described(run: LoadedRun, folder: Path) -> tuple[str, list[tuple[float, floa
         run: the checkpoint.
         folder: that it lies in; files there that are damaged tell nothing.
     """
+    from gridreg.training.curves import History
+
     parts: list[str] = [folder.resolve().name]
     curve: list[tuple[float, float]] = []
     with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
         metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
         parts.append(f"{float(metrics['mean']['psnr']):.2f} dB")
     parts.append("built-in scene" if run.config.scene is None else Path(run.config.scene).name)
-    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-        rows = [
-            json.loads(line) for line in (folder / "history.jsonl").read_text(encoding="utf-8").splitlines()
-        ]
+    with contextlib.suppress(InputError):
+        rows = History.load(folder / "history.jsonl").rows
         curve = [(float(row["step"]), float(row["psnr"])) for row in rows if "psnr" in row]
     return ", ".join(parts), curve

@@ -21,6 +21,7 @@ from gridreg.export._admission import Admission
 from gridreg.export.cameras import Orbit
 from gridreg.rendering.cameras import Camera, Lens
 from gridreg.scenes import Views
+from gridreg.training.images import to_uint8
 
 __all__ = [
     "add_frustums",
@@ -134,10 +135,9 @@ def add_frustums(
         clicked: called with the ``viser.ClientHandle`` and the number of the view that was clicked.
     """
     found = {}
-    images = (views.composited(background.cpu()) * 255).round().to(torch.uint8).cpu().numpy()
     stride = max(1, math.ceil(len(views) / _MOST_FRUSTUMS))
     for i in range(0, len(views), stride):
-        small = Image.fromarray(images[i])
+        small = Image.fromarray(to_uint8(views.over(i, background)))
         small.thumbnail((128, 128))
         pose = views.poses[i].double().cpu().numpy()
         x, y, z, w = Rotation.from_matrix(pose[:3, :3] @ _FLIP).as_quat()

@@ -12,7 +12,7 @@ from gridreg.errors import InputError
 from gridreg.scenes.files import read_json
 from gridreg.training.files import write_json
 
-__all__ = ["load_crop", "save_crop"]
+__all__ = ["checked_crop", "load_crop", "save_crop"]
 
 Box = NDArray[np.float64]
 
@@ -33,7 +33,17 @@ def load_crop(words: Sequence[str]) -> Box:
         raise InputError(
             f"crop: found {' '.join(words)!r}, expected X0 Y0 Z0 X1 Y1 Z1 or a file that the viewer has saved"
         ) from None
-    if not np.isfinite(box).all() or not (box[0] < box[1]).all():
+    return checked_crop(box)
+
+
+def checked_crop(box: Box) -> Box:
+    """Return a box ``(2, 3)`` in float64.
+
+    Raises:
+        InputError: for another shape, numbers that are not finite, or a box without volume.
+    """
+    box = np.asarray(box, dtype=np.float64)
+    if box.shape != (2, 3) or not np.isfinite(box).all() or not (box[0] < box[1]).all():
         raise InputError(f"crop: found {box.tolist()}, expected a lower and a larger upper corner")
     return box
 

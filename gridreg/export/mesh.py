@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gridreg.errors import InputError
+from gridreg.export.decimation import decimate
 from gridreg.export.marching import Faces, Vertices, drop_small_components, polygonise, vertex_normals
 from gridreg.export.volume import SeenDensity, sample_density, surface_threshold
 from gridreg.machine import check_memory
@@ -44,6 +45,14 @@ class Mesh:
     metric: bool = False
     places: Vertices | None = None
     texture: Colours | None = None
+
+    def reduced(self, faces: int) -> Mesh:
+        """The same mesh with at most so many faces, each vertex in the colour of the nearest one of before."""
+        if len(self.faces) <= faces:
+            return self
+        vertices, triangles, nearest = decimate(self.vertices, self.faces, faces)
+        colours = None if self.colours is None else self.colours[nearest]
+        return replace(self, vertices=vertices, faces=triangles, colours=colours)
 
     @property
     def size(self) -> str:

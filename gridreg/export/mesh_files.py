@@ -15,7 +15,8 @@ from PIL import Image
 
 from gridreg.errors import InputError, silenced
 from gridreg.export._glb import Y_UP, glb_of, srgb_of
-from gridreg.export.decimation import check_faces, decimate
+from gridreg.export.crop_box import checked_crop
+from gridreg.export.decimation import check_faces
 from gridreg.export.mesh import Mesh, extract_mesh
 from gridreg.export.sheet_base import OnSheet
 from gridreg.export.texture import check_texture, textured
@@ -145,10 +146,8 @@ def write_mesh(
     if crop is not None:
         options["bounds"] = _cropped(field.bounds, crop, world)
     mesh = extract_mesh(field, occupancy, resolution=resolution, **options)
-    if faces is not None and len(mesh.faces) > faces:
-        vertices, triangles, nearest = decimate(mesh.vertices, mesh.faces, faces)
-        colours = None if mesh.colours is None else mesh.colours[nearest]
-        mesh = replace(mesh, vertices=vertices, faces=triangles, colours=colours)
+    if faces is not None:
+        mesh = mesh.reduced(faces)
     if texture is not None:
         mesh = textured(mesh, field, occupancy, texture, resolution)
     if world != IN_PLACE:
@@ -158,9 +157,7 @@ def write_mesh(
 
 
 def _cropped(bounds: torch.Tensor, crop: NDArray[np.float64], world: World) -> torch.Tensor:
-    box = np.asarray(crop, dtype=np.float64)
-    if box.shape != (2, 3) or not np.isfinite(box).all() or not (box[0] < box[1]).all():
-        raise InputError(f"crop: found {box.tolist()}, expected a lower and a larger upper corner")
+    box = checked_crop(crop)
     inner = torch.from_numpy((box - world.origin) / world.unit).to(bounds)
     found = torch.stack([torch.maximum(inner[0], bounds[0]), torch.minimum(inner[1], bounds[1])])
     if not bool((found[0] < found[1]).all()):

@@ -19,13 +19,12 @@ from PIL import Image
 
 from gridreg.errors import InputError
 from gridreg.export.cameras import Orbit, orbit_of_box, orbit_of_views
-from gridreg.export.decimation import decimate
 from gridreg.export.html import encode, open_image, page_environment, spread_views, target_beside
 from gridreg.export.images import MAX_DEVIATION, to_image
 from gridreg.export.line_chart import Series, line_chart
 from gridreg.export.mesh import Mesh
 from gridreg.export.mesh_files import read_mesh
-from gridreg.export.page_object import next_camera, object_data, photographs_of
+from gridreg.export.page_object import next_camera, object_data, small_photographs
 from gridreg.rendering.cameras import Camera, Lens
 from gridreg.rendering.model import Model
 from gridreg.scenes import Scene
@@ -73,7 +72,7 @@ def write_page(
     if mesh is not None and scene is not None:
         mesh = replace(mesh, metric=scene.world.metric)
     orbit = _orbit(scene, mesh)
-    photographs = [] if scene is None else photographs_of(scene.train, scene.background)
+    photographs = [] if scene is None else small_photographs(scene.train, scene.background)
     score, note = _score(record)
     beyond = next_camera(_found(places, "next.json"))
     name = record.get("scene") or (scene.name if scene is not None else "scene")
@@ -136,11 +135,7 @@ def _mesh(places: Sequence[Path]) -> tuple[Mesh | None, str]:
     path = _found(places, "mesh.ply")
     if path is None:
         return None, "gridreg mesh makes one, if the field has a surface"
-    mesh = read_mesh(path)
-    if len(mesh.faces) <= FACES:
-        return mesh, ""
-    vertices, faces, nearest = decimate(mesh.vertices, mesh.faces, FACES)
-    return Mesh(vertices, faces, None if mesh.colours is None else mesh.colours[nearest]), ""
+    return read_mesh(path).reduced(FACES), ""
 
 
 def _orbit(scene: Scene | None, mesh: Mesh | None) -> Orbit:

@@ -18,8 +18,9 @@ from gridreg.export.html import data_uri
 from gridreg.export.mesh import Mesh
 from gridreg.scenes import Scene, Views, World
 from gridreg.scenes.files import read_json
+from gridreg.training.images import to_uint8
 
-__all__ = ["next_camera", "object_data", "photographs_of"]
+__all__ = ["next_camera", "object_data", "small_photographs"]
 
 _PHOTOGRAPHS, _THUMBNAIL = 60, 160
 _UINT16 = 2**16 - 1
@@ -74,15 +75,12 @@ def _stand(
     return {"pose": np.round(pose[:3], 6).flatten().tolist(), "edges": edges}
 
 
-def photographs_of(views: Views, background: torch.Tensor) -> list[tuple[str, str]]:
+def small_photographs(views: Views, background: torch.Tensor) -> list[tuple[str, str]]:
     """Names and small images of the views, in the order of `_cameras`."""
     chosen = _chosen(views)
     found = []
     for i in chosen:
-        rgba = views.image(i)
-        alpha = rgba[..., 3:]
-        image = rgba[..., :3] * alpha + background * (1 - alpha)
-        small = Image.fromarray((image * 255).round().to(torch.uint8).cpu().numpy())
+        small = Image.fromarray(to_uint8(views.over(i, background)))
         small.thumbnail((_THUMBNAIL, _THUMBNAIL))
         found.append((views.names[i], data_uri(small, "jpeg")))
     return found

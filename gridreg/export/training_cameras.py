@@ -74,12 +74,9 @@ class TrainingCameras:
         rendered = model.render(Camera(views.poses[number], lens), stop=stop)
         if rendered is None:
             return None
-        rgba = views.image(number).permute(2, 0, 1)[None]
         # Colours weigh as much as they cover, so they are averaged on their background.
-        alpha, behind = rgba[:, 3:], self._background.to(rgba).view(1, 3, 1, 1)
-        seen = F.interpolate(
-            rgba[:, :3] * alpha + (1 - alpha) * behind, (lens.height, lens.width), mode="area"
-        )
+        seen = views.over(number, self._background).permute(2, 0, 1)[None]
+        seen = F.interpolate(seen, (lens.height, lens.width), mode="area")
         target = seen[0].permute(1, 2, 0)
         error = float((rendered.colour.to(target) - target).square().mean())
         psnr = -10 * math.log10(max(error, 1e-12))

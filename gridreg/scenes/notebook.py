@@ -6,6 +6,7 @@ import base64
 import html
 import io
 from collections.abc import Iterable
+from itertools import islice
 
 import numpy as np
 from PIL import Image
@@ -25,10 +26,10 @@ def card(title: str, facts: str, images: Iterable[bytes] = ()) -> str:
     return f"<div><b>{html.escape(title)}</b><br>{html.escape(facts)}<br>{shown}</div>"
 
 
-def thumbnails(images: Tensor) -> list[bytes]:
-    """The first images ``(V, H, W, 3)`` in [0, 1], small, as PNG."""
+def thumbnails(images: Iterable[Tensor]) -> list[bytes]:
+    """The first images ``(H, W, 3)`` in [0, 1], small, as PNG."""
     found = []
-    for image in images[:_MOST]:
+    for image in islice(images, _MOST):
         small = Image.fromarray(np.asarray((image.clamp(0, 1) * 255).round().byte().cpu()))
         small.thumbnail((_EDGE, _EDGE))
         file = io.BytesIO()

@@ -34,8 +34,9 @@ from gridreg.scenes.own_images import (
     shrink_images,
 )
 from gridreg.scenes.photographs import is_video, sharpest_frames
+from gridreg.scenes.silhouettes import backdrop_of, is_opaque
 from gridreg.scenes.transforms import EXTENT_KEY
-from gridreg.scenes.views import IN_PLACE, Views, World
+from gridreg.scenes.views import IN_PLACE, World
 
 __all__ = ["Prepared", "prepare"]
 
@@ -276,11 +277,8 @@ def _write(
 
 def _shows_room(frame: Frame, scene: Path) -> bool:
     """Tell whether an image is neither transparent anywhere nor on one colour."""
-    rgba = torch.from_numpy(read_rgba(scene / frame.file_path, opaque=True))[None]
-    # Any camera that fits the image: its colours alone are asked for.
-    height, width = rgba.shape[1:3]
-    camera = torch.tensor([[width, width, width / 2, height / 2]])
-    return Views(rgba, torch.eye(4)[None], camera, ("image",), (0,)).shows_room
+    pixels = torch.from_numpy(read_rgba(scene / frame.file_path, opaque=True))[None]
+    return is_opaque(pixels) and backdrop_of(pixels) is None
 
 
 def _upwards(up: Array) -> Array:

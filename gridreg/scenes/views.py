@@ -16,13 +16,9 @@ from gridreg.errors import InputError
 from gridreg.scenes.gate import check_cameras, check_extent
 from gridreg.scenes.notebook import card, thumbnails
 from gridreg.scenes.pixels import as_floats
-from gridreg.scenes.silhouettes import silhouettes
+from gridreg.scenes.silhouettes import backdrop_of, is_opaque, silhouettes_before
 
 __all__ = ["IN_PLACE", "Scene", "Views", "World", "background_colour"]
-
-# Fraction of the edge that is looked at for a backdrop, and of its pixels that must have the colour up to a
-# bound.
-_FRAME, _AGREEING, _CLOSE = 0.02, 0.9, 0.05
 
 _COLOURS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 
@@ -150,11 +146,6 @@ class Views:
         """Return one image, ``(H, W, 4)`` float32."""
         return as_floats(self.pixels[number])
 
-    @property
-    def _opaque(self) -> bool:
-        top = 1 if self.pixels.is_floating_point() else 255
-        return not bool((self.pixels[..., 3] < top).any())
-
     @functools.cached_property
     def backdrop(self) -> Tensor | None:
         """The one colour that opaque images have along their edges (a sheet of paper, a studio), ``(3,)``.
@@ -168,25 +159,12 @@ class Views:
             >>> views.backdrop.tolist()
             [1.0, 1.0, 1.0]
         """
-        if not len(self) or not self._opaque:
-            return None
-        pixels = self._frame
-        colour = pixels.median(dim=0).values
-        agreeing = ((pixels - colour).abs().amax(dim=-1) < _CLOSE).float().mean()
-        return colour if float(agreeing) >= _AGREEING else None
+        return backdrop_of(self.pixels)
 
     @property
     def shows_room(self) -> bool:
         """Whether there is something behind the object: images are opaque, and not before a `backdrop`."""
-        return self.backdrop is None and self._opaque
-
-    @property
-    def _frame(self) -> Tensor:
-        """Colours ``(N, 3)`` along the edges of all images."""
-        edge = max(1, round(_FRAME * min(self.height, self.width)))
-        rgb = self.pixels[..., :3]
-        sides = rgb[:, :edge], rgb[:, -edge:], rgb[:, :, :edge], rgb[:, :, -edge:]
-        return as_floats(torch.cat([side.reshape(-1, 3) for side in sides]))
+        return self.backdrop is None and is_opaque(self.pixels)
 
     @functools.cached_property
     def silhouettes(self) -> Tensor:
@@ -196,8 +174,7 @@ class Views:
         """
         if self.backdrop is None:
             return as_floats(self.pixels[..., 3])
-        off = (self._frame - self.backdrop).abs().amax(dim=-1)
-        return silhouettes(as_floats(self.pixels[..., :3]), self.backdrop, off[off < _CLOSE])
+        return silhouettes_before(self.pixels, self.backdrop)
 
     @property
     def plain(self) -> list[str]:
@@ -223,10 +200,14 @@ class Views:
         """
         colour = background_colour(background).to(self.pixels.device)
         composited = colour.new_empty((*self.pixels.shape[:3], 3))
-        for stored, target in zip(self.pixels, composited, strict=True):
-            rgba = as_floats(stored)
-            target.copy_(rgba[..., :3] * rgba[..., 3:] + colour * (1 - rgba[..., 3:]))
+        for number, target in enumerate(composited):
+            target.copy_(self.over(number, colour))
         return composited
+
+    def over(self, number: int, colour: Tensor) -> Tensor:
+        """Return one image ``(H, W, 3)`` over a colour ``(3,)``, see `composited`."""
+        rgba, colour = self.image(number), colour.to(self.pixels.device)
+        return rgba[..., :3] * rgba[..., 3:] + colour * (1 - rgba[..., 3:])
 
     def to(self, device: torch.device | str) -> Views:
         """Return the same views with their tensors on ``device``."""
@@ -293,4 +274,6 @@ class Scene:
     def _repr_html_(self) -> str:
         """The training views as notebooks show them."""
         facts = f"{self.protocol}: {self.train!r} to train on, {self.test!r} to score on"
-        return card(self.name, facts, thumbnails(self.train.composited(self.background)))
+        return card(
+            self.name, facts, thumbnails(self.train.over(i, self.background) for i in range(len(self.train)))
+        )
