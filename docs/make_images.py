@@ -205,6 +205,11 @@ def report() -> bytes:
 
 
 def screenshot(url: str, size: tuple[int, int], ready: str, wait: float = 3) -> bytes:
+    """What `photographed` shows, as it is stored."""
+    return webp(photographed(url, size, ready, wait))
+
+
+def photographed(url: str, size: tuple[int, int], ready: str, wait: float = 3) -> ImageArray:
     """A page in headless Chromium, once a JavaScript expression holds, and some seconds later."""
     import tempfile
     import time
@@ -215,7 +220,7 @@ def screenshot(url: str, size: tuple[int, int], ready: str, wait: float = 3) -> 
         tab.open(url)
         tab.until(lambda: tab.evaluate(ready))
         time.sleep(wait)
-        return webp(tab.screenshot())
+        return np.asarray(tab.screenshot())
 
 
 def webp(image: ImageArray) -> bytes:

@@ -10,21 +10,20 @@ from __future__ import annotations
 
 import argparse
 import io
-import shutil
-import subprocess
-import tempfile
+import sys
 from pathlib import Path
 
 from PIL import Image, ImageOps
 
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+from make_images import photographed
+
 from gridreg.cli.runs import photographs_of
-from gridreg.errors import InputError
 from gridreg.scenes.board import board_image, get_board
 from gridreg.training.files import write_bytes
 
 FOLDER = Path(__file__).with_name("photographs")
 LARGEST = 100_000
-_CHROMIUM = ("chromium", "chromium-browser", "google-chrome")
 
 
 def contact_sheet(photographs: Path, width: int = 900, columns: int = 4) -> Image.Image:
@@ -39,36 +38,6 @@ def contact_sheet(photographs: Path, width: int = 900, columns: int = 4) -> Imag
         x, y = cell * (k % columns), cell * (k // columns)
         sheet.paste(small, (x + (cell - small.width) // 2, y + (cell - small.height) // 2))
     return sheet
-
-
-def screenshot(page: Path, width: int = 420, height: int = 860) -> Image.Image:
-    """Return what a telephone shows of a page.
-
-    Raises:
-        InputError: without Chromium.
-    """
-    program = next((found for name in _CHROMIUM if (found := shutil.which(name))), None)
-    if program is None:
-        raise InputError(f"{page}: needs one of {', '.join(_CHROMIUM)} to be drawn")
-    with tempfile.TemporaryDirectory() as scratch:
-        shot = Path(scratch) / "shot.png"
-        options = ["--headless", "--no-sandbox", "--disable-quic", "--no-first-run"]
-        options += ["--disable-background-networking", "--disable-component-update", "--disable-sync"]
-        options += [
-            "--use-angle=swiftshader",
-            "--enable-unsafe-swiftshader",
-            "--virtual-time-budget=8000",
-            f"--user-data-dir={scratch}/user",
-        ]
-        command = [
-            program,
-            *options,
-            f"--window-size={width},{height}",
-            f"--screenshot={shot}",
-            page.resolve().as_uri(),
-        ]
-        subprocess.run(command, check=True, capture_output=True, timeout=120)
-        return Image.open(shot).convert("RGB")
 
 
 def as_jpeg(image: Image.Image) -> bytes:
@@ -94,7 +63,7 @@ def main() -> int:
         "taken": contact_sheet(photographs_of(Path("builtin"))),
         "cameras": Image.open(out / "scene/cameras.png"),
         "masks": Image.open(out / "scene/masks.jpg"),
-        "page": screenshot(out / "index.html"),
+        "page": Image.fromarray(photographed((out / "index.html").resolve().as_uri(), (420, 860), "true")),
     }
     FOLDER.mkdir(exist_ok=True)
     for name, image in images.items():
