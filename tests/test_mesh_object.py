@@ -16,7 +16,7 @@ import trimesh
 from PIL import Image
 
 from gridreg.errors import InputError
-from gridreg.export import read_mesh, write_mesh
+from gridreg.export import Mesh, read_mesh, save_mesh, write_mesh
 from gridreg.export.crop_box import load_crop, save_crop
 from gridreg.rendering import OccupancyGrid
 from gridreg.scenes import World
@@ -166,6 +166,32 @@ class TestTexture:
             assert "map_Kd ball.png" in (tmp_path / "ball.mtl").read_text()
         else:
             assert "COLOR_0" not in glb_json(path)["meshes"][0]["primitives"][0]["attributes"]
+
+    @pytest.mark.parametrize("suffix", [".obj", ".glb"])
+    def test_a_texture_is_read_by_somebody_else(self, tmp_path: Path, suffix: str) -> None:
+        corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1e-3]])
+        faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+        places = np.array([[0.0, 0], [1, 0], [0, 1], [1, 1]])
+        pixels = np.random.default_rng(0).integers(0, 256, (16, 16, 3), dtype=np.uint8)
+        save_mesh(Mesh(corners, faces, places=places, texture=pixels), tmp_path / f"two words{suffix}")
+        names = {".obj": ["two words.mtl", "two words.obj", "two words.png"], ".glb": ["two words.glb"]}
+        assert sorted(p.name for p in tmp_path.iterdir()) == names[suffix]
+        loaded = trimesh.load(tmp_path / f"two words{suffix}", process=False, force="mesh")
+        material = loaded.visual.material
+        image = material.image if suffix == ".obj" else material.baseColorTexture
+        np.testing.assert_array_equal(np.asarray(image.convert("RGB")), pixels)
+        np.testing.assert_allclose(loaded.visual.uv, places, atol=1e-6)
+        np.testing.assert_array_equal(loaded.faces, faces)
+        if suffix == ".obj":
+            np.testing.assert_allclose(loaded.vertices, corners, atol=1e-8)
+            lines = (tmp_path / "two words.mtl").read_text().splitlines()
+            assert "Kd 1.00000000 1.00000000 1.00000000" in lines
+            assert (
+                (tmp_path / "two words.obj").read_text().startswith("# gridreg, 1 x 1 x 0.001 units of the")
+            )
+        else:
+            surface = glb_json(tmp_path / "two words.glb")["materials"][0]["pbrMetallicRoughness"]
+            assert (surface["metallicFactor"], surface["roughnessFactor"]) == (0, 1)
 
     def test_what_is_refused_before_any_work(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         field = AnalyticField(ball(0.5))

@@ -12,6 +12,9 @@ import torch
 import trimesh
 from numpy.typing import NDArray
 from PIL import Image
+from trimesh.exchange.obj import export_obj
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import SimpleMaterial
 
 from gridreg.errors import InputError, silenced
 from gridreg.export._glb import Y_UP, glb_of, srgb_of
@@ -60,14 +63,9 @@ def save_mesh(mesh: Mesh, path: str | Path) -> None:
     _check_target(path, None if mesh.texture is None else 1)
     with writing(path) as temporary:
         if kind == ".glb":
-            texture = None if mesh.texture is None else _png(mesh.texture)
-            vertices = mesh.vertices @ Y_UP.T
-            content = glb_of(vertices, mesh.faces, mesh.colours, mesh.places, texture, size=mesh.size)
+            content = glb_of(mesh)
         elif mesh.texture is not None:
-            write_bytes(path.with_suffix(".png"), _png(mesh.texture))
-            material = f"newmtl object\nKa 0 0 0\nKd 1 1 1\nmap_Kd {path.stem}.png\n"
-            write_bytes(path.with_suffix(".mtl"), material.encode())
-            content = _obj(mesh, path.stem)
+            content = _textured_obj(mesh, path)
         else:
             scale = 1000 if kind == ".stl" and mesh.metric else 1
             scaled = replace(mesh, vertices=scale * mesh.vertices).to_trimesh()
@@ -76,20 +74,21 @@ def save_mesh(mesh: Mesh, path: str | Path) -> None:
         temporary.write_bytes(content)
 
 
-def _png(image: NDArray[np.uint8]) -> bytes:
-    buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, format="PNG")
-    return buffer.getvalue()
-
-
-def _obj(mesh: Mesh, name: str) -> bytes:
-    assert mesh.places is not None
-    buffer = io.BytesIO()
-    buffer.write(f"# gridreg, {mesh.size}\nmtllib {name}.mtl\nusemtl object\n".encode())
-    np.savetxt(buffer, mesh.vertices, "v %.7g %.7g %.7g")
-    np.savetxt(buffer, mesh.places, "vt %.6f %.6f")
-    np.savetxt(buffer, (mesh.faces + 1).repeat(2, axis=1), "f %d/%d %d/%d %d/%d")
-    return buffer.getvalue()
+def _textured_obj(mesh: Mesh, path: Path) -> bytes:
+    """Write image and material beside the file, and return what belongs into it."""
+    assert mesh.texture is not None
+    black, white = (0, 0, 0, 255), (255, 255, 255, 255)
+    material: Any = SimpleMaterial(  # type: ignore[no-untyped-call]
+        Image.fromarray(mesh.texture), white, black, black, glossiness=1.0, name=path.stem
+    )
+    visual: Any = TextureVisuals(uv=mesh.places, material=material)  # type: ignore[no-untyped-call]
+    made = trimesh.Trimesh(mesh.vertices, mesh.faces, visual=visual, process=False)
+    text, beside = export_obj(  # type: ignore[no-untyped-call]
+        made, return_texture=True, mtl_name=f"{path.stem}.mtl", header=f"gridreg, {mesh.size}"
+    )
+    for file, content in beside.items():
+        write_bytes(path.with_name(file), content)
+    return str(text).encode()
 
 
 def _commented(content: bytes, kind: str, said: bytes) -> bytes:
