@@ -17,6 +17,7 @@ import numpy as np
 import stored
 import torch
 from stored import Record
+from surface import mesh_image
 
 from gridreg.cli import run_cli
 from gridreg.export import (
@@ -29,7 +30,6 @@ from gridreg.export import (
     save_mesh,
     write_mesh,
 )
-from gridreg.export.compare import sample_surface
 from gridreg.export.images import to_image
 from gridreg.training import TrainOptions, configure, execute, open_scene
 from gridreg.training.files import check_output_folder
@@ -91,44 +91,6 @@ def reconstruct(subject: Path, protocol: str, arguments: argparse.Namespace) -> 
     print(table_row(metrics), flush=True)
 
 
-def mesh_image(mesh: Mesh, camera: Camera, *, coloured: bool, samples: int = 1_500_000) -> np.ndarray:
-    """Return an image ``(H, W, 3)`` uint8 of a mesh on white, lit from the camera, without a graphics card.
-
-    Points are spread densely over the surface; the nearest is in front.
-
-    Args:
-        mesh: in world coordinates.
-        camera: from where.
-        coloured: with the colours of the vertices; else grey, which shows the shape.
-        samples: points on the surface; several for each pixel, or holes remain.
-    """
-    points, faces = sample_surface(mesh, samples, torch.Generator().manual_seed(0))
-    corners = mesh.vertices[mesh.faces[faces]]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
-    pose = camera.pose.double().numpy()
-    local = (points - pose[:3, 3]) @ pose[:3, :3]
-    fx, fy, cx, cy = camera.lens.intrinsics
-    depth = -local[:, 2]
-    safe = np.maximum(depth, 1e-9)
-    column = np.floor(cx + fx * local[:, 0] / safe).astype(int)
-    row = np.floor(cy - fy * local[:, 1] / safe).astype(int)
-    away = points - pose[:3, 3]
-    facing = -(normals * away).sum(axis=1) / np.linalg.norm(away, axis=1)
-    height, width = camera.lens.height, camera.lens.width
-    # Faces that look away are hidden by those before them; drawing them would fill holes wrongly.
-    seen = (depth > 0) & (facing > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    light = 0.25 + 0.75 * np.clip(facing, 0, 1)
-    colour = np.full((len(points), 3), 0.72)
-    if coloured and mesh.colours is not None:
-        colour = mesh.colours[mesh.faces[faces]].mean(axis=1) / 255
-    shaded = np.clip(colour * light[:, None], 0, 1)
-    image = np.full((height, width, 3), 255, np.uint8)
-    order = np.argsort(-depth[seen], kind="stable")
-    image[row[seen][order], column[seen][order]] = np.rint(255 * shaded[seen][order])
-    return image
-
-
 def cameras(truth: Mesh, width: int = 220, height: int = 420) -> list[Camera]:
     """Return where the images are taken from: around the true mesh, the same for every run."""
     low, high = truth.vertices.min(axis=0), truth.vertices.max(axis=0)
@@ -163,10 +125,10 @@ def draw(subject: Path, protocols: list[str], arguments: argparse.Namespace) -> 
 
 
 def _shown(mesh: Mesh, places: list[Camera]) -> np.ndarray:
-    shapes = [mesh_image(mesh, camera, coloured=False) for camera in places]
+    shapes = [mesh_image(mesh, camera, colours=False) for camera in places]
     if mesh.colours is None:
         return row(shapes)
-    return row([*shapes, *(mesh_image(mesh, camera, coloured=True) for camera in places)])
+    return row([*shapes, *(mesh_image(mesh, camera, colours=True) for camera in places)])
 
 
 def table_row(metrics: Record) -> str:
@@ -190,22 +152,18 @@ def table(results: Path) -> None:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = stored.parser_of(__doc__, threads=True)
     parser.add_argument("--data", type=Path, help="folder that holds the subjects")
     parser.add_argument("--subjects", nargs="+", default=["subject_a"])
     parser.add_argument("--protocols", nargs="+", default=["human8", "human50"])
     parser.add_argument("--preset", default="human")
     parser.add_argument("--steps", type=int, help="iterations; the schedule's events move in proportion")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--threads", type=int)
     parser.add_argument("--resolution", type=int, default=256, help="lattice nodes of the mesh")
     parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="such as train.rays=2048")
     parser.add_argument(
         "--meshes", type=Path, default=MESHES, help="folder of the meshes; default: %(default)s"
     )
-    parser.add_argument("--results", type=Path, default=stored.RESULTS, help="folder of the stored figures")
     parser.add_argument("--table", action="store_true", help="print what is stored, and end")
     arguments = parser.parse_args()
     if arguments.table:

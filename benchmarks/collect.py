@@ -8,7 +8,6 @@ machines and places of files stay behind. `docs/make_results.py` reads what it s
 
 from __future__ import annotations
 
-import argparse
 import re
 from pathlib import Path
 
@@ -51,12 +50,9 @@ def collect(folder: Path, name: str, results: Path = stored.RESULTS) -> list[str
 
 def main() -> int:
     """Parse the command line, and print how many runs were stored."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = stored.parser_of(__doc__)
     parser.add_argument("store", type=Path, help="folder that an ablation has written")
     parser.add_argument("study", help="its name in the store")
-    parser.add_argument("--results", type=Path, default=stored.RESULTS, help="folder of the stored figures")
     arguments = parser.parse_args()
     names = collect(arguments.store, arguments.study, arguments.results)
     print(f"{len(names)} runs in {arguments.results / arguments.study}.jsonl")

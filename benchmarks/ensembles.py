@@ -161,9 +161,7 @@ def store_deviation(folder: Path, run: str, arguments: argparse.Namespace) -> No
 
 def main(words: Sequence[str] | None = None) -> int:
     """Parse the command line and score."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = stored.parser_of(__doc__, threads=True)
     parser.add_argument("--data", type=Path, required=True, help="folder that holds the scenes")
     parser.add_argument("--kept", type=Path, required=True, help="as given to benchmarks/quality.py --keep")
     parser.add_argument("--scenes", nargs="+", required=True)
@@ -173,8 +171,6 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--deviation", action="store_true", help="whether deviation tells where they are wrong"
     )
-    parser.add_argument("--threads", type=int)
-    parser.add_argument("--results", type=Path, default=stored.RESULTS, help="folder of the stored figures")
     arguments = parser.parse_args(words)
     if len(arguments.seeds) < 2:
         raise InputError(f"--seeds: found {len(arguments.seeds)}, expected at least two")

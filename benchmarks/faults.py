@@ -17,7 +17,6 @@ benchmarks/results/faults.jsonl; exit status 1 if anything was lost or differs.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import random
@@ -245,13 +244,10 @@ def writers(trial: Trial) -> dict[str, Any]:
 
 def main() -> int:
     """Do what was asked for, store the result, and return 1 if there was a fault."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = stored.parser_of(__doc__)
     parser.add_argument("--kills", type=int, default=100)
     parser.add_argument("--only", nargs="*", default=["kills", "disks", "signals", "writers"])
     parser.add_argument("--seed", type=int, default=0, help="of the moments")
-    parser.add_argument("--results", type=Path, default=stored.RESULTS)
     options = parser.parse_args()
     torch.set_num_threads(1)
     signal.signal(signal.SIGHUP, signal.SIG_DFL)  # Under nohup it is ignored, and a run rightly leaves it so.

@@ -247,19 +247,16 @@ def chosen(field: str, options: argparse.Namespace) -> str:
 
 def main(words: Sequence[str] | None = None) -> int:
     """Parse the command line, and choose or compare."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = stored.parser_of(__doc__, threads=True)
     parser.add_argument("do", choices=("choose", "compare", "cost"))
     parser.add_argument("--data", type=Path, help="folder that holds the scenes")
     parser.add_argument("--scenes", nargs="+", default=["builtin"])
     parser.add_argument("--fields", nargs="+", choices=FIELDS, default=list(FIELDS))
     parser.add_argument("--seeds", nargs="+", type=int, default=[0], help="of `compare`")
     parser.add_argument("--steps", type=int, default=STEPS)
-    parser.add_argument("--threads", type=int, default=torch.get_num_threads())
-    parser.add_argument("--results", type=Path, default=stored.RESULTS)
     options = parser.parse_args(words)
-    torch.set_num_threads(options.threads)
+    if options.threads:
+        torch.set_num_threads(options.threads)
     if options.do == "cost":
         for field in options.fields:
             cost(field, open_scene("builtin", None), options)

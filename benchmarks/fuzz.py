@@ -13,7 +13,6 @@ replays. The figures go to benchmarks/results/fuzz.jsonl after each round of 200
 
 from __future__ import annotations
 
-import argparse
 import sys
 import tempfile
 import time
@@ -116,14 +115,11 @@ class Campaign:
 
 def main() -> None:
     """Run a campaign, print and store its figures; exit with 1 if anything failed."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = stored.parser_of(__doc__)
     parser.add_argument("--minutes", type=float, default=1.0, help="how long, at the least")
     parser.add_argument("--inputs", type=int, default=0, help="how many, at the least")
     parser.add_argument("--corpus", type=Path, default=Path("outputs/fuzz"), help="folder for failures")
     parser.add_argument("--seed", type=int, default=0, help="of the first round")
-    parser.add_argument("--results", type=Path, default=stored.RESULTS)
     options = parser.parse_args()
     began, end = time.monotonic(), time.monotonic() + 60 * (0.0 if options.inputs else options.minutes)
     campaign = Campaign(options.corpus)

@@ -11,7 +11,6 @@ to benchmarks/results/load.jsonl.
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import os
@@ -179,11 +178,8 @@ def apart(act: Callable[[], Any]) -> tuple[int, float, float]:
 
 def main() -> int:
     """Measure what was asked for, store it, and return 1 if a bound was missed."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = stored.parser_of(__doc__)
     parser.add_argument("tasks", nargs="*", default=[], help=", ".join(TASKS))
-    parser.add_argument("--results", type=Path, default=stored.RESULTS)
     options = parser.parse_args()
     torch.set_num_threads(1)
     missed = 0

@@ -132,9 +132,7 @@ def row(metrics: Record) -> str:
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = stored.parser_of(__doc__, threads=True)
     parser.add_argument("--data", type=Path, help="folder that holds the scenes")
     parser.add_argument("--scenes", nargs="+", default=[])
     parser.add_argument("--runs", nargs="+", default=["quick"])
@@ -142,7 +140,6 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--steps", type=int)
     parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="such as field.decoder=mlp")
     parser.add_argument("--protocol", default=PROTOCOL)
-    parser.add_argument("--threads", type=int)
     parser.add_argument(
         "--backend", choices=("auto", "torch"), default="auto", help="torch: train by the plain path"
     )
@@ -155,7 +152,6 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--opaque", action="store_true", help="without alpha: the images on the protocol's background"
     )
-    parser.add_argument("--results", type=Path, default=stored.RESULTS, help="folder of the stored figures")
     parser.add_argument("--table", action="store_true", help="print what is stored, and end")
     arguments = parser.parse_args(words)
     if arguments.table:

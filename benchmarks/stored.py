@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import fcntl
 import json
 import os
@@ -69,6 +70,15 @@ def _alone(folder: Path) -> Iterator[None]:
         yield
     finally:
         os.close(opened)
+
+
+def parser_of(about: str | None, *, threads: bool = False) -> argparse.ArgumentParser:
+    """Return a parser for a program with this docstring, with the options that programs here have in common."""
+    parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
+    if threads:
+        parser.add_argument("--threads", type=int, help="processor threads; default: all cores")
+    parser.add_argument("--results", type=Path, default=RESULTS, help="folder of the stored figures")
+    return parser
 
 
 def command_line(program: str) -> list[str]:

@@ -103,7 +103,7 @@ def test_images_of_meshes() -> None:
     mesh = tetrahedron()
     place = np.array([4.0, 4.0, 4.0])
     camera = Camera(look_at(place, np.zeros(3), np.array([0.0, 0, 1])), Lens.from_angle(25.0, 120, 120))
-    shape, coloured = (bodies.mesh_image(mesh, camera, coloured=c, samples=200_000) for c in (False, True))
+    shape, coloured = (bodies.mesh_image(mesh, camera, colours=c, points=200_000) for c in (False, True))
     inside = (shape != 255).any(axis=-1)
     # The outline of the corners, without holes.
     local = (mesh.vertices - place) @ camera.pose[:3, :3].double().numpy()

@@ -35,6 +35,8 @@ def mesh_image(mesh: Mesh, camera: Camera, *, colours: bool, points: int = 3_000
     row = np.floor(-fy * seen[:, 1] / depth + cy).astype(int)
     height, width = camera.lens.height, camera.lens.width
     inside = (depth > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    # Faces that look away are hidden by those before them; drawing them would fill holes wrongly.
+    inside &= (normals[chosen] * (places - pose[:3, 3])).sum(axis=1) < 0
     light = pose[:3, :3] @ np.array([-0.4, 0.6, 0.7])
     facing = normals[chosen] @ light / np.maximum(areas[chosen], 1e-12) / np.linalg.norm(light)
     shade = 0.35 + 0.65 * facing.clip(0, 1)
