@@ -15,6 +15,7 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).parent))
 from drawing import comparison, filters, masks, penalties, sampling
+from drawing.svg import drawn
 from generated import write_or_check
 
 FOLDER = Path(__file__).with_name("diagrams")
@@ -26,7 +27,10 @@ def diagrams() -> dict[str, str]:
     """Return all diagrams, SVG text by name."""
     torch.set_num_threads(1)
     parts = [module.diagrams() for module in (masks, filters, penalties, sampling, comparison)]
-    return {name: text for part in parts for name, text in part.items()}
+    shown = {name: content for part in parts for name, content in part.items()}
+    return {
+        name: content if isinstance(content, str) else drawn(name, content) for name, content in shown.items()
+    }
 
 
 def same(first: str, second: str) -> bool:

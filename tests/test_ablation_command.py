@@ -17,7 +17,7 @@ import tyro
 from gridreg.ablation import command
 from gridreg.ablation.command import AblationOptions, make_runner, run
 from gridreg.ablation.processes import Processes
-from gridreg.ablation.progress import StudyProgress, dry_run_lines, estimate
+from gridreg.ablation.progress import StudyProgress, dry_run_lines, left_in_words, seconds_left
 from gridreg.ablation.records import RunResult
 from gridreg.ablation.runners import Event, InProcess
 from gridreg.ablation.store import Store
@@ -40,26 +40,20 @@ def result(label="a", status="done", seconds=4.0, steps=100, seed=0, **changes):
 def test_the_estimate_likens_runs_to_finished_ones():
     done = [result("a", seconds=4.0), result("b", seconds=6.0), result("c", seconds=60.0, steps=1000)]
     left = [result("d", "waiting", 0.0), result("e", "running", 0.0), result("f", "failed", 0.0)]
-    found = estimate([*done, *left])
-    assert (found.runs, found.based_on) == (2, 3)
-    assert found.seconds == pytest.approx(5.0 + 5.0)
+    assert left_in_words([*done, *left]) == "2 runs left, about 0:10 (from 3 finished runs)"
+    assert seconds_left([*done, *left]) == pytest.approx(5.0 + 5.0)
     # Nothing like it is finished: seconds of a step count.
-    other = estimate([*done, result("d", "waiting", 0.0, steps=600)])
-    assert other.seconds == pytest.approx(600 * 70 / 1200)
+    other = seconds_left([*done, result("d", "waiting", 0.0, steps=600)])
+    assert other == pytest.approx(600 * 70 / 1200)
 
 
 def test_the_estimate_in_words():
-    assert estimate([]).describe() == "no run is left"
+    assert left_in_words([]) == "no run is left"
     one = [result("a", "waiting", 0.0)]
-    assert (
-        estimate(one).describe()
-        == "1 run left; no run is finished yet, so there is no estimate of their time"
-    )
+    assert left_in_words(one) == "1 run left; no run is finished yet, so there is no estimate of their time"
     some = [result("a", seconds=60.0), *(result("b", "waiting", 0.0, seed=seed) for seed in range(4))]
-    assert estimate(some).describe() == "4 runs left, about 4:00 (from 1 finished run)"
-    assert (
-        estimate(some).describe(workers=3) == "4 runs left, about 1:20 with 3 at a time (from 1 finished run)"
-    )
+    assert left_in_words(some) == "4 runs left, about 4:00 (from 1 finished run)"
+    assert left_in_words(some, workers=3) == "4 runs left, about 1:20 with 3 at a time (from 1 finished run)"
 
 
 def test_a_dry_run_lists_rows_and_counts_runs():

@@ -7,8 +7,8 @@ import torch
 from torch import nn
 
 import gridreg
-from drawing.masks import SHARES, TOTAL, seen, site
-from drawing.svg import Panel, document, number, ridges
+from drawing.masks import TOTAL, over_run, seen, site
+from drawing.svg import Line, Ridges, document, number
 
 CHANNELS = 18
 
@@ -18,35 +18,22 @@ def variant(name: str) -> gridreg.FrequencyMask:
     return gridreg.FrequencyMask(site(), until=1.0, variant=name)  # type: ignore[arg-type]
 
 
-def forms() -> dict[str, str]:
+def forms() -> dict[str, Ridges]:
     """The three forms side by side."""
-    titles = {
-        "block": "block: FreeNeRF's program, ours",
-        "printed": "printed: the equation in the papers",
-        "authors": "authors: Few TensoRF's program",
-    }
+    names = enumerate(("block", "printed", "authors"), start=1)
     return {
-        f"contradiction-{name}": ridges(
-            title, seen(variant(name), channels=CHANNELS), SHARES, series=[k] * CHANNELS
-        )
-        for k, (name, title) in enumerate(titles.items(), start=1)
+        f"contradiction-{name}": over_run(variant(name), channels=CHANNELS, series=[k] * CHANNELS)
+        for k, name in names
     }
 
 
-def one_channel(channel: int = 9) -> str:
+def one_channel(channel: int = 9) -> list[Line]:
     """One channel in both forms."""
-    panel = Panel(
-        f"Channel {channel} of {CHANNELS} over the run",
-        x=(0, 1), y=(0, 1.25), x_label="fraction of the run", y_label="mask", x_ticks=(0, 0.2, 0.4, 0.6, 0.8, 1),
-        y_ticks=(0, 0.5, 1),
-    )  # fmt: skip
     steps = np.arange(TOTAL + 1)
-    for series, name in enumerate(("block", "printed"), start=1):
-        row = seen(variant(name), channels=CHANNELS, steps=steps)[channel]
-        panel.line(steps / TOTAL, row, series, dashed=name == "block")
-    panel.note(0.47, 0.6, "block", 1)
-    panel.note(0.02, 1.12, "printed: falls from almost 1 to 0, twice", 2)
-    return panel.svg()
+    block, printed = (
+        seen(variant(name), channels=CHANNELS, steps=steps)[channel] for name in ("block", "printed")
+    )
+    return [Line(steps / TOTAL, block, 1, dashed=True), Line(steps / TOTAL, printed, 2)]
 
 
 class Product(nn.Module):
@@ -61,23 +48,19 @@ class Product(nn.Module):
         return self.plane * self.line
 
 
-def squared(channel: int = 9) -> str:
-    """Draw the factor of a product if one factor is masked, or both."""
-    panel = Panel(
-        f"Factor of a plane-line product, channel {channel}",
-        x=(0.25, 0.6), y=(0, 1.15), x_label="fraction of the run", x_ticks=(0.3, 0.4, 0.5, 0.6), y_ticks=(0, 0.5, 1),
-    )  # fmt: skip
+def squared(channel: int = 9) -> list[Line]:
+    """The factor of a product if one factor is masked, or both."""
     steps = np.arange(int(0.25 * TOTAL), int(0.6 * TOTAL) + 1)
-    for series, (glob, text) in enumerate((("line", "line masked"), ("*", "both masked")), start=1):
+    lines = []
+    for series, glob in enumerate(("line", "*"), start=1):
         field, row = Product(), []
         mask = gridreg.FrequencyMask(gridreg.parameters(glob, dim=0), until=1.0)
         with gridreg.apply(field, mask, total_steps=TOTAL) as handle, torch.no_grad():
             for step in steps.tolist():
                 handle.step(step)
                 row.append(float(field()[channel]))
-        panel.line(steps / TOTAL, row, series)
-        panel.note(0.275, 1.02 - 0.14 * series, text, series)
-    return panel.svg()
+        lines.append(Line(steps / TOTAL, row, series))
+    return lines
 
 
 def order(name: gridreg.encodings.Order, title: str, progress: float = 0.25, coordinates: str = "xyz") -> str:
@@ -112,23 +95,9 @@ def order(name: gridreg.encodings.Order, title: str, progress: float = 0.25, coo
     return document(parts, 200)
 
 
-def reach() -> str:
-    """Draw how far 20 steps of half a voxel reach in a box of edge 3."""
+def diagrams() -> dict[str, Ridges | list[Line] | str]:
+    """What each diagram shows, or SVG text."""
     nodes = np.arange(64, 513, 4)
-    panel = Panel(
-        "Reach of the first 20 steps, box of edge 3",
-        x=(64, 512), y=(0, 0.5), x_label="nodes along an edge (step: half a voxel)", y_label="world units",
-        x_ticks=(64, 128, 300, 512), y_ticks=(0, 0.1, 0.2, 0.3, 0.4, 0.5),
-    )  # fmt: skip
-    panel.line(nodes, 20 * 0.5 * 3.0 / (nodes - 1))
-    panel.line([64, 512], [0.3, 0.3], 2, dashed=True)
-    panel.note(500, 0.315, "distance=0.3", 2, "end")
-    panel.note(150, 0.22, "samples=20", 1)
-    return panel.svg()
-
-
-def diagrams() -> dict[str, str]:
-    """SVG text by name."""
     return {
         **forms(),
         "contradiction-channel": one_channel(),
@@ -136,5 +105,9 @@ def diagrams() -> dict[str, str]:
         "order-octave": order("octave", "octave by octave"),
         "order-sines": order("sines_first", "all sines, then all cosines"),
         "order-coordinate": order("coordinate", "coordinate by coordinate"),
-        "contradiction-reach": reach(),
+        # How far 20 steps of half a voxel reach in a box of edge 3.
+        "contradiction-reach": [
+            Line(nodes, 20 * 0.5 * 3.0 / (nodes - 1)),
+            Line([64, 512], [0.3, 0.3], 2, dashed=True),
+        ],
     }

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from torch import nn
 
 import gridreg
-from drawing.svg import ridges
+from drawing.svg import Ridges
 
 TOTAL = 600
 STEPS = np.arange(TOTAL + 1)
-SHARES = STEPS / TOTAL
+FRACTIONS = STEPS / TOTAL
 
 
 class Ones(nn.Module):
@@ -58,69 +58,46 @@ def encoding_labels(coordinates: str, octaves: Sequence[int]) -> list[str]:
     return [*coordinates, *waves]
 
 
-def diagrams() -> dict[str, str]:
-    """SVG text by name."""
+def over_run(
+    *regularizers: gridreg.Regularizer,
+    channels: int,
+    series: Sequence[int] | None = None,
+    labels: Sequence[str] | None = None,
+) -> Ridges:
+    """Regularizers over the whole run."""
+    return Ridges(seen(*regularizers, channels=channels), FRACTIONS, series, labels)
+
+
+def diagrams() -> dict[str, Ridges]:
+    """What each diagram shows."""
     coordinate = gridreg.octaves_of_channels(2, 4, "coordinate")
     octave = gridreg.octaves_of_channels(2, 4, "octave")
     levels = [level for level in range(8) for _ in range(2)]
-    bands = gridreg.spherical_bands(9)
-    drawn = {
-        "mask-frequency": ridges(
-            "FrequencyMask(until=0.9) by channel",
-            seen(gridreg.FrequencyMask(site(), until=0.9), channels=18),
-            SHARES,
-        ),
-        "mask-octaves": ridges(
-            "FrequencyMask(until=0.9) by octave",
-            seen(gridreg.FrequencyMask(site(coordinate), until=0.9), channels=18),
-            SHARES,
-            y_label="",
+    rising, fixed = gridreg.FrequencyMask(site(), until=0.9), gridreg.FixedMask(site(), visible_ratio=0.8)
+    # A draw holds until the next step.
+    coarse = np.arange(0, TOTAL + 1, 12)
+    held = np.repeat(coarse, 2)[1:] / TOTAL
+    draws = seen(gridreg.ComponentDropout(site()), channels=10, steps=coarse)
+    return {
+        "mask-frequency": over_run(rising, channels=18),
+        "mask-octaves": over_run(
+            gridreg.FrequencyMask(site(coordinate), until=0.9),
+            channels=18,
             series=by_octave(coordinate),
             labels=encoding_labels("xy", coordinate),
         ),
-        "mask-fixed": ridges(
-            "FixedMask(visible_ratio=0.8)",
-            seen(gridreg.FixedMask(site(), visible_ratio=0.8), channels=18),
-            SHARES,
+        "mask-fixed": over_run(fixed, channels=18),
+        "mask-cosine": over_run(
+            gridreg.CosineMask(site(octave), until=0.9), channels=18, series=by_octave(octave)
         ),
-        "mask-cosine": ridges(
-            "CosineMask(until=0.9) by octave",
-            seen(gridreg.CosineMask(site(octave), until=0.9), channels=18),
-            SHARES,
-            series=by_octave(octave),
+        "mask-level": over_run(
+            gridreg.LevelMask(site(), start=2, every=0.1), channels=16, series=by_octave(levels)
         ),
-        "mask-level": ridges(
-            "LevelMask(start=2, every=0.1)",
-            seen(gridreg.LevelMask(site(), start=2, every=0.1), channels=16),
-            SHARES,
-            series=by_octave(levels),
+        "mask-view": over_run(
+            gridreg.ViewDependenceMask(site(), bands=2, until=0.7),
+            channels=9,
+            series=by_octave(gridreg.spherical_bands(9)),
         ),
-        "mask-view": ridges(
-            "ViewDependenceMask(bands=2, until=0.7)",
-            seen(gridreg.ViewDependenceMask(site(), bands=2, until=0.7), channels=9),
-            SHARES,
-            y_label="coefficient",
-            series=by_octave(bands),
-            row=17,
-        ),
-        "mask-two": ridges(
-            "FrequencyMask and FixedMask on one site",
-            seen(
-                gridreg.FrequencyMask(site(), until=0.9),
-                gridreg.FixedMask(site(), visible_ratio=0.8),
-                channels=18,
-            ),
-            SHARES,
-        ),
+        "mask-two": over_run(rising, fixed, channels=18),
+        "mask-dropout": Ridges(np.repeat(draws, 2, axis=1)[:, :-1] / 1.25, held),
     }
-    coarse = np.arange(0, TOTAL + 1, 12)
-    # A draw holds until the next step.
-    held = np.repeat(coarse, 2)[1:]
-    draws = seen(gridreg.ComponentDropout(site()), channels=10, steps=coarse)
-    drawn["mask-dropout"] = ridges(
-        "ComponentDropout(): p from 0 to 0.2",
-        np.repeat(draws, 2, axis=1)[:, :-1] / 1.25,
-        held / TOTAL,
-        row=16,
-    )
-    return drawn

@@ -41,15 +41,15 @@ def curves(section: Section, histories: Histories) -> dict[str, object] | None:
         ``held_out``, ``y_label`` and ``charts``: pairs of a scene and its chart.
     """
     style = styles(section.rows)
-    every = [row for runs in section.results.values() for run in runs for row in histories(run)]
-    held_out = any(name in row for row in every for name in _LOOKS)
+    every = [line for row in section.rows for run in row.finished for line in histories(run)]
+    held_out = any(name in line for line in every for name in _LOOKS)
     x_label = "training (s)" if held_out else "iteration"
     y_label = "held-out PSNR (dB)" if held_out else "PSNR of training batches (dB)"
     charts = []
     for scene in section.scenes:
         series = []
         for row in section.rows:
-            runs = [run for run in section.results[row.name] if run.spec.scene_name == scene]
+            runs = [run for run in row.finished if run.spec.scene_name == scene]
             points = _mean_curve([histories(run) for run in runs], held_out)
             final = [(figure_of(run, "seconds"), figure_of(run, "psnr")) for run in runs]
             known = [(x, y) for x, y in final if x is not None and y is not None] if held_out else []

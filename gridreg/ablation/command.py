@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -140,16 +140,14 @@ def make_runner(options: AblationOptions) -> Runner:
 
 def _print_runs(study: Study, out: Path, options: AblationOptions) -> None:
     """Print the runs and an estimate of their time; nothing is written."""
-    known: dict[str, RunResult] = {}
-    if (out / "store.sqlite").is_file():
-        known = {result.spec.hash: result for result in Store.open(out, create=False).results()}
-    results = []
-    for spec in study.runs:
-        found = known.get(spec.hash)
-        base = found or RunResult(spec, "waiting", None, "", out / "runs" / spec.hash, 0.0, "")
-        results.append(
-            RunResult(spec, base.status, base.metrics, base.reason, base.folder, base.seconds, base.machine)
-        )
+    stored = Store.open(out, create=False).results() if (out / "store.sqlite").is_file() else []
+    known = {result.spec.hash: result for result in stored}
+    results = [
+        replace(known[spec.hash], spec=spec)
+        if spec.hash in known
+        else RunResult(spec, "waiting", None, "", out, 0.0, "")
+        for spec in study.runs
+    ]
     workers = options.workers or (
         1 if options.runner == "local" else usable_cores() // (options.threads or 1)
     )

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 from gridreg.ablation.records import RunResult, RunSpec, Study
 from gridreg.ablation.statistics import Cell, Difference, Estimate, estimate, holm, paired_differences
 from gridreg.errors import InputError
 
-__all__ = ["LEVEL", "Row", "Section", "Setting", "compare", "figure_of"]
+__all__ = ["LEVEL", "Row", "Section", "Setting", "cell_of", "compare", "figure_of"]
 
 LEVEL = 0.05
 """Chance of a false finding that intervals (95 %) and tests allow."""
@@ -56,34 +57,67 @@ class Row:
     Args:
         name: for people; the label, with preset and backbone where the table has several.
         label: of the study.
-        preset: where the configuration started from.
-        backbone: name of the field.
         is_baseline: whether others are compared with it.
-        done, failed, expected: numbers of runs.
-        uses_alpha: whether any run starts from the alpha masks of its views (carving).
-        metrics: mean and interval by metric (``psnr``, ``ssim_gaussian``, ...) over scenes and seeds.
-        seconds: of training; None when nothing is finished.
+        expected: number of its runs.
+        runs: those that have a result.
         difference: in PSNR to the baseline, dB; None for the baseline, and where the table has none to compare with.
         adjusted_p: Holm's p-value over all rows of the table; None below two pairs.
-        scenes: PSNR over seeds by scene, dB.
-        scene_differences: to the baseline by scene, dB.
     """
 
     name: str
     label: str
-    preset: str
-    backbone: str
     is_baseline: bool
-    done: int
-    failed: int
     expected: int
-    uses_alpha: bool
-    metrics: Mapping[str, Estimate]
-    seconds: Estimate | None
+    runs: tuple[RunResult, ...]
     difference: Difference | None
     adjusted_p: float | None
-    scenes: Mapping[str, Estimate]
-    scene_differences: Mapping[str, Difference]
+
+    @cached_property
+    def finished(self) -> tuple[RunResult, ...]:
+        """Its finished runs."""
+        return tuple(run for run in self.runs if run.status == "done")
+
+    @property
+    def done(self) -> int:
+        """Number of finished runs."""
+        return len(self.finished)
+
+    @property
+    def failed(self) -> int:
+        """Number of failed runs."""
+        return sum(run.status == "failed" for run in self.runs)
+
+    @property
+    def uses_alpha(self) -> bool:
+        """Whether any run starts from the alpha masks of its views (carving)."""
+        return any((run.metrics or {}).get("uses_alpha", False) for run in self.finished)
+
+    @cached_property
+    def metrics(self) -> dict[str, Estimate]:
+        """Mean and interval by metric (``psnr``, ``ssim_gaussian``, ...) over scenes and seeds."""
+        names = dict.fromkeys(name for run in self.finished for name in (run.metrics or {}).get("mean", {}))
+        return _means({name: [figure_of(run, name) for run in self.finished] for name in names})
+
+    @property
+    def seconds(self) -> Estimate | None:
+        """Seconds of training; None when nothing is finished."""
+        return _means({"": [figure_of(run, "seconds") for run in self.finished]}).get("")
+
+    @cached_property
+    def scenes(self) -> dict[str, Estimate]:
+        """PSNR over seeds by scene, dB."""
+        found: dict[str, list[float | None]] = {}
+        for run in self.finished:
+            found.setdefault(run.spec.scene_name, []).append(figure_of(run, "psnr"))
+        return _means(found)
+
+    @cached_property
+    def scene_differences(self) -> dict[str, Difference]:
+        """Differences to the baseline by scene, dB."""
+        found: dict[str, dict[Cell, float]] = {}
+        for cell, value in (self.difference.pairs if self.difference else {}).items():
+            found.setdefault(cell.scene, {})[cell] = value
+        return {scene: Difference(pairs, estimate(pairs.values()), None) for scene, pairs in found.items()}
 
     @property
     def outcome(self) -> str:
@@ -110,14 +144,17 @@ class Section:
         baseline: label of the row that the others are compared with.
         scenes: their names, in the order of the study.
         rows: in the order of the study.
-        results: its finished runs by the row's name.
     """
 
     setting: Setting
     baseline: str
     scenes: tuple[str, ...]
     rows: tuple[Row, ...]
-    results: Mapping[str, tuple[RunResult, ...]]
+
+    @property
+    def results(self) -> dict[str, tuple[RunResult, ...]]:
+        """Finished runs by the row's name."""
+        return {row.name: row.finished for row in self.rows}
 
     @property
     def extent(self) -> str:
@@ -149,7 +186,14 @@ def compare(study: Study, results: Iterable[RunResult]) -> list[Section]:
     Raises:
         InputError: two results for the same place in the same row.
     """
-    found = _by_place(results)
+    found: dict[tuple[str, Cell], RunResult] = {}
+    for result in results:
+        place = (result.spec.label, cell_of(result.spec))
+        if found.setdefault(place, result).spec.hash != result.spec.hash:
+            raise InputError(
+                f"study: two different runs are called {result.spec.describe()!r}; expected one label for each "
+                "composition"
+            )
     # Its folder may be given like any other scene's: then only finished runs know what it is.
     builtin = {r.spec.scene_name for r in found.values() if (r.metrics or {}).get("builtin", False)}
     sections: dict[Setting, list[RunSpec]] = {}
@@ -161,23 +205,10 @@ def compare(study: Study, results: Iterable[RunResult]) -> list[Section]:
     return [_section(setting, study, sections[setting], found) for setting in published_first]
 
 
-def _cell(spec: RunSpec) -> Cell:
-    return Cell(
-        spec.scene_name, spec.protocol, spec.views, spec.seed, spec.preset, spec.backbone, spec.size or 0
-    )
-
-
-def _by_place(results: Iterable[RunResult]) -> dict[tuple[str, Cell], RunResult]:
-    found: dict[tuple[str, Cell], RunResult] = {}
-    for result in results:
-        place = (result.spec.label, _cell(result.spec))
-        if place in found and found[place].spec.hash != result.spec.hash:
-            raise InputError(
-                f"study: two different runs are called {result.spec.describe()!r}; expected one label for each "
-                "composition"
-            )
-        found[place] = result
-    return found
+def cell_of(spec: RunSpec) -> Cell:
+    """All that a run has in common with those that it is compared with."""
+    size = spec.size or 0
+    return Cell(spec.scene_name, spec.protocol, spec.views, spec.seed, spec.preset, spec.backbone, size)
 
 
 def _section(
@@ -186,51 +217,26 @@ def _section(
     kinds: dict[tuple[str, str, str], list[RunSpec]] = {}
     for spec in specs:
         kinds.setdefault((spec.label, spec.preset, spec.backbone), []).append(spec)
-    names = _names(list(kinds))
-    results = {
-        names[kind]: tuple(found[place] for s in kinds[kind] if (place := (s.label, _cell(s))) in found)
-        for kind in kinds
-    }
-    differences = _differences(kinds, results, names, study.baseline)
-    tested = [name for name, d in differences.items() if d.p_value is not None]
-    adjusted = dict(zip(tested, holm([differences[name].p_value or 0.0 for name in tested]), strict=True))
-    rows = []
-    for (label, preset, backbone), asked in kinds.items():
-        name = names[(label, preset, backbone)]
-        own = results[name]
-        done = [result for result in own if result.status == "done"]
-        difference = differences.get(name)
-        rows.append(
-            Row(
-                name=name,
-                label=label,
-                preset=preset,
-                backbone=backbone,
-                is_baseline=_is_baseline(label, study.baseline),
-                done=len(done),
-                failed=sum(result.status == "failed" for result in own),
-                expected=len(asked),
-                uses_alpha=any((result.metrics or {}).get("uses_alpha", False) for result in done),
-                metrics=_estimates(done),
-                seconds=_estimate(done, "seconds"),
-                difference=difference,
-                adjusted_p=adjusted.get(name),
-                scenes=_by_scene(done),
-                scene_differences=_split_by_scene(difference),
-            )
-        )
-    scenes = tuple(dict.fromkeys(spec.scene_name for spec in specs))
-    finished = {name: tuple(r for r in own if r.status == "done") for name, own in results.items()}
-    return Section(setting, study.baseline, scenes, tuple(rows), finished)
-
-
-def _names(kinds: Sequence[tuple[str, str, str]]) -> dict[tuple[str, str, str], str]:
-    """The label is the name, unless one label has several presets or backbones in this table."""
     labels = [label for label, _, _ in kinds]
-    return {
-        (label, preset, backbone): label if labels.count(label) == 1 else f"{label} ({preset}, {backbone})"
-        for label, preset, backbone in kinds
-    }
+    rows: list[Row] = []
+    values: dict[str, dict[Cell, float]] = {study.baseline: {}}
+    for (label, preset, backbone), asked in kinds.items():
+        # One label may have several presets or backbones in this table.
+        name = label if labels.count(label) == 1 else f"{label} ({preset}, {backbone})"
+        runs = tuple(found[place] for spec in asked if (place := (label, cell_of(spec))) in found)
+        rows.append(Row(name, label, _is_baseline(label, study.baseline), len(asked), runs, None, None))
+        # The cell holds preset and backbone, so every row finds the baseline of its own.
+        own = values.setdefault(study.baseline if rows[-1].is_baseline else name, {})
+        own |= {cell_of(run.spec): psnr for run in runs if (psnr := figure_of(run, "psnr")) is not None}
+    every = paired_differences(values, study.baseline)
+    differences = {name: difference for name, difference in every.items() if difference.pairs}
+    p_values = {name: d.p_value for name, d in differences.items() if d.p_value is not None}
+    adjusted = dict(zip(p_values, holm(list(p_values.values())), strict=True))
+    compared = [
+        replace(row, difference=differences.get(row.name), adjusted_p=adjusted.get(row.name)) for row in rows
+    ]
+    scenes = tuple(dict.fromkeys(spec.scene_name for spec in specs))
+    return Section(setting, study.baseline, scenes, tuple(compared))
 
 
 def _is_baseline(label: str, baseline: str) -> bool:
@@ -239,45 +245,7 @@ def _is_baseline(label: str, baseline: str) -> bool:
     return label == baseline or (bool(bracket) and label.startswith(f"{stem} ["))
 
 
-def _differences(
-    kinds: Mapping[tuple[str, str, str], Sequence[RunSpec]],
-    results: Mapping[str, Sequence[RunResult]],
-    names: Mapping[tuple[str, str, str], str],
-    baseline: str,
-) -> dict[str, Difference]:
-    values: dict[str, dict[Cell, float]] = {baseline: {}}
-    for kind in kinds:
-        # The cell holds preset and backbone, so every row finds the baseline of its own.
-        row = values.setdefault(baseline if _is_baseline(kind[0], baseline) else names[kind], {})
-        for result in results[names[kind]]:
-            value = figure_of(result, "psnr")
-            if value is not None:
-                row[_cell(result.spec)] = value
-    every = paired_differences(values, baseline)
-    return {name: difference for name, difference in every.items() if difference.pairs}
-
-
-def _estimate(results: Iterable[RunResult], metric: str) -> Estimate | None:
-    values = [value for result in results if (value := figure_of(result, metric)) is not None]
-    return estimate(values) if values else None
-
-
-def _estimates(results: Sequence[RunResult]) -> dict[str, Estimate]:
-    metrics = dict.fromkeys(metric for result in results for metric in (result.metrics or {}).get("mean", {}))
-    found = {metric: _estimate(results, metric) for metric in metrics}
-    return {metric: value for metric, value in found.items() if value is not None}
-
-
-def _by_scene(results: Sequence[RunResult]) -> dict[str, Estimate]:
-    scenes: dict[str, list[RunResult]] = {}
-    for result in results:
-        scenes.setdefault(result.spec.scene_name, []).append(result)
-    found = {scene: _estimate(own, "psnr") for scene, own in scenes.items()}
-    return {scene: value for scene, value in found.items() if value is not None}
-
-
-def _split_by_scene(difference: Difference | None) -> dict[str, Difference]:
-    scenes: dict[str, dict[Cell, float]] = {}
-    for cell, value in (difference.pairs if difference else {}).items():
-        scenes.setdefault(cell.scene, {})[cell] = value
-    return {scene: Difference(pairs, estimate(pairs.values()), None) for scene, pairs in scenes.items()}
+def _means(figures: Mapping[str, Iterable[float | None]]) -> dict[str, Estimate]:
+    """Mean and interval of the figures that are known, by name; none where there are none."""
+    known = {name: [value for value in own if value is not None] for name, own in figures.items()}
+    return {name: estimate(own) for name, own in known.items() if own}

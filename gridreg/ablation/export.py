@@ -20,9 +20,37 @@ def table_rows(results: Sequence[RunResult]) -> list[dict[str, Any]]:
 
     Columns that only finished runs have are None in the others.
     """
-    scores = _keys(results, "mean")
-    phases = _keys(results, "seconds")
-    return [_row(result, scores, phases) for result in results]
+    groups = {
+        group: sorted({key for result in results for key in (result.metrics or {}).get(group, {})})
+        for group in ("mean", "seconds")
+    }
+    rows = []
+    for result in results:
+        spec, metrics = result.spec, result.metrics or {}
+        mean, seconds, versions = (metrics.get(group, {}) for group in ("mean", "seconds", "versions"))
+        rows.append(
+            {
+                "label": spec.label,
+                "scene": spec.scene_name,
+                "protocol": spec.protocol,
+                "views": spec.views,
+                "seed": spec.seed,
+                "preset": spec.preset,
+                "backbone": spec.backbone,
+                "status": result.status,
+                **{score: _number(mean.get(score)) for score in groups["mean"]},
+                "steps": metrics.get("steps"),
+                "seconds": result.seconds if result.status == "done" else None,
+                **{f"seconds_{phase}": _number(seconds.get(phase)) for phase in groups["seconds"]},
+                "threads": versions.get("threads"),
+                "machine": result.machine or None,
+                "gridreg": versions.get("gridreg"),
+                "torch": versions.get("torch"),
+                "reason": result.reason or None,
+                "hash": spec.hash,
+            }
+        )
+    return rows
 
 
 def export_results(results: Sequence[RunResult], path: Path) -> Path:
@@ -54,35 +82,6 @@ def export_results(results: Sequence[RunResult], path: Path) -> Path:
 def _cell(value: Any) -> Any:
     """A value for a spreadsheet, which would take text that begins like a formula for one and run it."""
     return f"'{value}" if isinstance(value, str) and value.startswith(tuple("=+-@\t\r")) else value
-
-
-def _keys(results: Sequence[RunResult], group: str) -> list[str]:
-    return sorted({key for result in results if result.metrics for key in result.metrics.get(group, {})})
-
-
-def _row(result: RunResult, scores: Sequence[str], phases: Sequence[str]) -> dict[str, Any]:
-    spec, metrics = result.spec, result.metrics or {}
-    mean, seconds, versions = (metrics.get(group, {}) for group in ("mean", "seconds", "versions"))
-    return {
-        "label": spec.label,
-        "scene": spec.scene_name,
-        "protocol": spec.protocol,
-        "views": spec.views,
-        "seed": spec.seed,
-        "preset": spec.preset,
-        "backbone": spec.backbone,
-        "status": result.status,
-        **{score: _number(mean.get(score)) for score in scores},
-        "steps": metrics.get("steps"),
-        "seconds": result.seconds if result.status == "done" else None,
-        **{f"seconds_{phase}": _number(seconds.get(phase)) for phase in phases},
-        "threads": versions.get("threads"),
-        "machine": result.machine or None,
-        "gridreg": versions.get("gridreg"),
-        "torch": versions.get("torch"),
-        "reason": result.reason or None,
-        "hash": spec.hash,
-    }
 
 
 def _number(value: Any) -> float | None:

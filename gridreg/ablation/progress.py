@@ -5,70 +5,50 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from statistics import fmean
 from typing import TextIO
 
 from gridreg.ablation.records import RunResult, RunSpec
 from gridreg.ablation.runners import Event
 from gridreg.training.progress import clock_time
 
-__all__ = ["Estimate", "StudyProgress", "dry_run_lines", "estimate"]
+__all__ = ["StudyProgress", "dry_run_lines", "left_in_words", "seconds_left"]
 
 
-@dataclass(frozen=True)
-class Estimate:
-    """Time that the runs that are left will take.
-
-    Args:
-        runs: that are left.
-        seconds: of all of them, one after another; None if no run is finished yet.
-        based_on: number of finished runs.
-    """
-
-    runs: int
-    seconds: float | None
-    based_on: int
-
-    def describe(self, workers: int = 1) -> str:
-        """In words, for some number of runs at a time.
-
-        Example:
-            >>> Estimate(4, 120.0, 2).describe(workers=2)
-            '4 runs left, about 1:00 with 2 at a time (from 2 finished runs)'
-        """
-        if self.runs == 0:
-            return "no run is left"
-        plural = "s" if self.runs > 1 else ""
-        if self.seconds is None:
-            return (
-                f"{self.runs} run{plural} left; no run is finished yet, so there is no estimate of their time"
-            )
-        beside = f" with {workers} at a time" if workers > 1 else ""
-        finished = f"{self.based_on} finished run{'s' if self.based_on > 1 else ''}"
-        left = clock_time(self.seconds / max(1, min(workers, self.runs)))
-        return f"{self.runs} run{plural} left, about {left}{beside} (from {finished})"
-
-
-def estimate(results: Sequence[RunResult]) -> Estimate:
-    """Estimate the time of the runs that are left from the seconds of those that are done.
+def seconds_left(results: Sequence[RunResult]) -> float | None:
+    """Estimate the time of the runs that are left, one after another; None if no run is finished yet.
 
     A run is likened to finished ones of the same preset, field and number of steps; failing that, the seconds of one
     step of all finished ones count.
     """
-    by_hash = {result.spec.hash: result for result in results}
-    done = [r for r in by_hash.values() if r.status == "done" and r.seconds > 0]
-    left = [r for r in by_hash.values() if r.status in ("waiting", "running")]
-    if not done:
-        return Estimate(len(left), None, 0)
-    like: dict[tuple[str, str, int], list[float]] = {}
-    for result in done:
-        like.setdefault(_kind(result.spec), []).append(result.seconds)
-    per_step = sum(r.seconds for r in done) / max(1, sum(_steps(r.spec) for r in done))
-    total = 0.0
-    for result in left:
-        known = like.get(_kind(result.spec))
-        total += sum(known) / len(known) if known else per_step * _steps(result.spec)
-    return Estimate(len(left), total, len(done))
+    runs = {result.spec.hash: result for result in results}.values()
+    done = [run for run in runs if run.status == "done" and run.seconds > 0]
+    alike: dict[tuple[str, str, int], list[float]] = {}
+    for run in done:
+        alike.setdefault(_kind(run.spec), []).append(run.seconds)
+    per_step = sum(run.seconds for run in done) / max(1, sum(_kind(run.spec)[-1] for run in done))
+    left = (_kind(run.spec) for run in runs if run.status in ("waiting", "running"))
+    total = sum(fmean(alike[kind]) if kind in alike else per_step * kind[-1] for kind in left)
+    return total if done else None
+
+
+def _kind(spec: RunSpec) -> tuple[str, str, int]:
+    return spec.preset, spec.backbone, int(spec.config.get("train", {}).get("steps", 1))
+
+
+def left_in_words(results: Sequence[RunResult], workers: int = 1) -> str:
+    """The number of runs that are left, and the time they take with some number of them at a time."""
+    statuses = list({result.spec.hash: result.status for result in results}.values())
+    left, done = len(statuses) - statuses.count("done") - statuses.count("failed"), statuses.count("done")
+    seconds = seconds_left(results)
+    if left == 0:
+        return "no run is left"
+    runs = f"{left} run{'s' * (left > 1)} left"
+    if seconds is None:
+        return f"{runs}; no run is finished yet, so there is no estimate of their time"
+    beside = f" with {workers} at a time" if workers > 1 else ""
+    wait = clock_time(seconds / max(1, min(workers, left)))
+    return f"{runs}, about {wait}{beside} (from {done} finished run{'s' * (done > 1)})"
 
 
 def dry_run_lines(results: Sequence[RunResult], workers: int = 1) -> list[str]:
@@ -76,7 +56,7 @@ def dry_run_lines(results: Sequence[RunResult], workers: int = 1) -> list[str]:
     lines = [f"{r.spec.hash}  {r.status:<8}{r.spec.describe()}" for r in results]
     unique = len({r.spec.hash for r in results})
     shared = f" ({len(results) - unique} rows share a run with another)" if unique < len(results) else ""
-    return [*lines, f"{unique} runs{shared}; {estimate(results).describe(workers)}"]
+    return [*lines, f"{unique} runs{shared}; {left_in_words(results, workers)}"]
 
 
 class StudyProgress:
@@ -107,18 +87,15 @@ class StudyProgress:
         """Take an event in."""
         if event.kind == "started":
             return
-        if event.kind == "done":
-            self.done += 1
-            what = f"PSNR {event.psnr:.2f} dB in {event.seconds:.1f} s" if event.psnr is not None else "done"
-        elif event.kind == "failed":
-            self.failed += 1
-            what = f"FAILED: {event.reason}"
-        else:
-            what = {
-                "interrupted": "stopped, its checkpoint is kept",
-                "lost": "lost with its worker, waits again",
-            }[event.kind]
+        self.done += event.kind == "done"
+        self.failed += event.kind == "failed"
         self._ended += event.kind in ("done", "failed")
+        what = {
+            "done": "done" if event.psnr is None else f"PSNR {event.psnr:.2f} dB in {event.seconds:.1f} s",
+            "failed": f"FAILED: {event.reason}",
+            "interrupted": "stopped, its checkpoint is kept",
+            "lost": "lost with its worker, waits again",
+        }[event.kind]
         stream = self._stream or sys.stderr
         print(f"[{self.describe()}] {event.spec.describe()}: {what}", file=stream, flush=True)
 
@@ -132,11 +109,3 @@ class StudyProgress:
         rate = self._ended / seconds
         left = (self.total - ended) / rate
         return f"{head}, {60 * rate:.1f} runs/min, left {clock_time(left)}"
-
-
-def _kind(spec: RunSpec) -> tuple[str, str, int]:
-    return spec.preset, spec.backbone, _steps(spec)
-
-
-def _steps(spec: RunSpec) -> int:
-    return int(spec.config.get("train", {}).get("steps", 1))

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-from gridreg.ablation.charts import curves, over_views, styles
+from gridreg.ablation.charts import Histories, curves, over_views, styles
 from gridreg.ablation.comparison import Row, Section, compare
 from gridreg.ablation.forest_plot import forest_plot, heat_map
 from gridreg.ablation.mask_images import colour_scale, mask_schedules
@@ -49,22 +49,20 @@ class HasResults(Protocol):
         """Results of the runs of a study, finished or not."""
 
 
-class _Histories:
-    """Reads each run's history once; one that cannot be read is empty, and said."""
+def _reader(problems: list[str]) -> Histories:
+    """Read each run's history once; one that cannot be read is empty, and told in ``problems``."""
+    known: dict[Path, list[dict[str, Any]]] = {}
 
-    def __init__(self) -> None:
-        self.problems: list[str] = []
-        self._known: dict[Path, Sequence[Mapping[str, object]]] = {}
-
-    def __call__(self, result: RunResult) -> Sequence[Mapping[str, object]]:
-        if result.folder not in self._known:
+    def rows_of(result: RunResult) -> Sequence[Mapping[str, object]]:
+        if result.folder not in known:
+            known[result.folder] = []
             try:
-                rows = result.history()
+                known[result.folder] += [r for r in result.history() if isinstance(r, dict) and "step" in r]
             except InputError as error:
-                self.problems.append(str(error))
-                rows = []
-            self._known[result.folder] = [row for row in rows if isinstance(row, dict) and "step" in row]
-        return self._known[result.folder]
+                problems.append(str(error))
+        return known[result.folder]
+
+    return rows_of
 
 
 def write_report(
@@ -102,7 +100,8 @@ def write_report(
 
 
 def _page(study: Study, results: Sequence[RunResult], sections: Sequence[Section], image_bytes: int) -> str:
-    histories = _Histories()
+    problems: list[str] = []
+    histories = _reader(problems)
     images = wipe_data(sections, image_bytes)
     source = study.source.encode("utf-8", "backslashreplace")
     return render(
@@ -127,7 +126,7 @@ def _page(study: Study, results: Sequence[RunResult], sections: Sequence[Section
         masks=mask_schedules(results, histories),
         scale=colour_scale(),
         failed=[result for result in results if result.status == "failed"],
-        problems=histories.problems,
+        problems=problems,
         provenance=provenance(study, results),
         download="data:text/yaml;base64," + base64.b64encode(source).decode(),
         images=images,

@@ -19,7 +19,7 @@ from gridreg.ablation.workers import Worker
 from gridreg.errors import InputError
 from gridreg.training.files import remove_folder
 
-__all__ = ["PAUSED", "Event", "InProcess", "Kind", "Report", "Runner", "serve", "settle"]
+__all__ = ["PAUSED", "Event", "InProcess", "Kind", "Report", "Runner", "settle"]
 
 Kind = Literal["started", "done", "failed", "interrupted", "lost"]
 
@@ -78,66 +78,42 @@ class InProcess:
         threads: of torch; default: as they are.
         keep_checkpoints: leave those of finished runs in their folders.
         device: where to compute.
+        log: what a run prints goes to its folder instead of the terminal.
     """
 
     threads: int | None = None
     keep_checkpoints: bool = True
     device: str = "cpu"
+    log: bool = False
 
     def run(self, store: Store, study: Study, report: Report) -> None:
         """See `Runner.run`."""
         if self.threads is not None:
             torch.set_num_threads(self.threads)
-        serve(store, study, report, keep_checkpoints=self.keep_checkpoints, device=self.device)
-
-
-def serve(
-    store: Store,
-    study: Study,
-    report: Report,
-    *,
-    keep_checkpoints: bool = True,
-    log: bool = False,
-    device: str = "cpu",
-) -> None:
-    """Claim and do one run after another until none of the study waits or is under way.
-
-    Args:
-        store: holds the study.
-        study: its runs.
-        report: told what happens.
-        keep_checkpoints: leave those of finished runs in their folders.
-        log: what a run prints goes to its folder instead of the terminal.
-        device: where to compute.
-
-    Raises:
-        KeyboardInterrupt: if it was interrupted; the run under way is saved and waits.
-        DiskFullError: if there is no space for results; the run under way waits.
-    """
-    worker, scenes = Worker.current(), Scenes(store.folder / "scenes", device)
-    while True:
-        claim = store.claim(worker, study)
-        if claim is None:
-            if store.counts(study)["running"] == 0:
-                return
-            # Somebody else has the last runs; if that worker dies, they come here.
-            time.sleep(_POLL)
-            continue
-        report(Event("started", claim.spec))
-        try:
-            with heartbeat(store.beat, [claim]):
-                result = perform(claim.spec, claim.folder, scenes, watch=claim.check, log=log)
-        except ClaimLostError:
-            report(Event("lost", claim.spec))
-            continue
-        except BaseException:
-            store.release(claim)
-            raise
-        settle(store, claim, result, report)
-        if result.metrics is not None and not keep_checkpoints:
-            remove_folder(claim.folder / "checkpoint")
-        if result.metrics is None and not result.reason:
-            raise KeyboardInterrupt
+        worker, scenes = Worker.current(), Scenes(store.folder / "scenes", self.device)
+        while True:
+            claim = store.claim(worker, study)
+            if claim is None:
+                if store.counts(study)["running"] == 0:
+                    return
+                # Somebody else has the last runs; if that worker dies, they come here.
+                time.sleep(_POLL)
+                continue
+            report(Event("started", claim.spec))
+            try:
+                with heartbeat(store.beat, [claim]):
+                    result = perform(claim.spec, claim.folder, scenes, watch=claim.check, log=self.log)
+            except ClaimLostError:
+                report(Event("lost", claim.spec))
+                continue
+            except BaseException:
+                store.release(claim)
+                raise
+            settle(store, claim, result, report)
+            if result.metrics is not None and not self.keep_checkpoints:
+                remove_folder(claim.folder / "checkpoint")
+            if result.metrics is None and not result.reason:
+                raise KeyboardInterrupt
 
 
 def settle(store: Store, claim: Claim, result: TaskResult, report: Report) -> None:

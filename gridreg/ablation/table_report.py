@@ -12,6 +12,7 @@ from typing import Any
 
 import tyro
 
+from gridreg.ablation.comparison import cell_of
 from gridreg.ablation.records import RunResult, RunSpec, Study
 from gridreg.ablation.report import write_report
 from gridreg.errors import InputError, near_names
@@ -100,15 +101,7 @@ def read_table(path: Path) -> tuple[str, list[RunResult]]:
             raise InputError(f"{path}:{line}: found another number of cells than of columns ({len(columns)})")
         result = _result({key.strip(): value.strip() for key, value in row.items()}, path, line)
         spec = result.spec
-        place = (
-            spec.label,
-            spec.scene_name,
-            spec.protocol,
-            spec.views,
-            spec.seed,
-            spec.preset,
-            spec.backbone,
-        )
+        place = (spec.label, cell_of(spec))
         if lines.setdefault(place, line) != line:
             raise InputError(
                 f"{path}:{line}: found the same run as in line {lines[place]}: {spec.describe()}"
@@ -146,14 +139,12 @@ def _result(row: Mapping[str, str], path: Path, line: int) -> RunResult:
     scores: dict[str, float] = {}
     for column, text in row.items():
         kind, _, view = column.partition(":")
+        if not text or column in (*_TEXTS, *_OTHERS) or column.startswith("seconds_"):
+            continue
         if kind in _IMAGES:
-            if text:
-                paths[view or "image" if kind == "image" else f"target:{view or 'image'}"] = (
-                    path.parent / text
-                )
-        elif column not in (*_TEXTS, *_OTHERS) and not column.startswith("seconds_"):
-            value = number(column, float, None)
-            scores |= {} if value is None else {column: value}
+            paths["target:" * (kind == "target") + (view or "image")] = path.parent / text
+        else:
+            scores[column] = number(column, float, None)
     done = "psnr" in scores and texts["status"] in ("", "done")
     seconds = number("seconds", float, None)
     train = number("seconds_train", float, seconds)

@@ -6,8 +6,6 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from PIL import Image
-
 from gridreg.ablation.comparison import Section
 from gridreg.ablation.records import RunResult
 from gridreg.export.html import encode, open_image, spread_views, target_beside
@@ -31,33 +29,23 @@ def wipe_data(sections: Sequence[Section], budget: int) -> list[list[dict[str, A
         For each section a list of ``{"scene", "view", "seed", "images": [{"name", "psnr", "src"}]}``; the target is the
         first image. An image that cannot be read is left out.
     """
-    places = [(number, scene) for number, section in enumerate(sections) for scene in section.scenes]
-    runs = {place: _runs_of(sections[place[0]], place[1]) for place in places}
-    views = {place: _views_of(runs[place].values()) for place in places}
-    found: dict[tuple[int, str], list[dict[str, Any]]] = {place: [] for place in places}
+    found: list[dict[str, list[dict[str, Any]]]] = [{s: [] for s in section.scenes} for section in sections]
+    places = []
+    for section, own in zip(sections, found, strict=True):
+        for scene, entries in own.items():
+            runs = _runs_of(section, scene)
+            places.append((entries, scene, runs, _views_of(runs.values())))
     used = 0
     # One of every scene, then another of every scene.
     for turn in range(VIEWS_PER_SCENE):
-        for place in places:
-            if turn >= len(views[place]):
-                continue
-            view = views[place][turn]
-            images = _images(runs[place], view)
+        for entries, scene, runs, views in places:
+            images = _images(runs, views[turn]) if turn < len(views) else []
             size = sum(len(image["src"]) for image in images)
             if len(images) > 1 and used + size <= budget:
                 used += size
-                seeds = sorted({run.spec.seed for run in runs[place].values()})
-                entry = {
-                    "scene": place[1],
-                    "view": view,
-                    "seed": ", ".join(map(str, seeds)),
-                    "images": images,
-                }
-                found[place].append(entry)
-    return [
-        [entry for place in places if place[0] == number for entry in found[place]]
-        for number in range(len(sections))
-    ]
+                seeds = ", ".join(map(str, sorted({run.spec.seed for run in runs.values()})))
+                entries.append({"scene": scene, "view": views[turn], "seed": seeds, "images": images})
+    return [[entry for entries in own.values() for entry in entries] for own in found]
 
 
 def first_choice(section: Section, data: Sequence[Mapping[str, Any]]) -> tuple[str, str]:
@@ -74,10 +62,7 @@ def first_choice(section: Section, data: Sequence[Mapping[str, Any]]) -> tuple[s
 
 def _runs_of(section: Section, scene: str) -> dict[str, RunResult]:
     """One run of each row, of the seed that most rows have."""
-    own = {
-        row.name: [run for run in section.results[row.name] if run.spec.scene_name == scene]
-        for row in section.rows
-    }
+    own = {row.name: [run for run in row.finished if run.spec.scene_name == scene] for row in section.rows}
     seeds = [run.spec.seed for runs in own.values() for run in runs]
     # The smallest one of those that are equally common.
     favourite = max(sorted(set(seeds)), key=seeds.count, default=0)
@@ -101,15 +86,9 @@ def _images(runs: Mapping[str, RunResult], view: str) -> list[dict[str, Any]]:
         if render is None:
             continue
         if not images:
-            target = _target(run, view, render)
-            if target is not None:
-                images.append({"name": "target", "psnr": None, "src": encode(target)})
+            own, compared = run.images.get(f"target:{view}"), run.folder / "test" / f"{view}_compare.png"
+            target = target_beside(compared, render) if own is None else open_image(own)
+            images += [] if target is None else [{"name": "target", "psnr": None, "src": encode(target)}]
         psnr = float((run.metrics or {})["images"][view].get("psnr", "nan"))
         images.append({"name": name, "psnr": psnr if math.isfinite(psnr) else None, "src": encode(render)})
     return images
-
-
-def _target(run: RunResult, view: str, render: Image.Image) -> Image.Image | None:
-    if f"target:{view}" in run.images:
-        return open_image(run.images[f"target:{view}"])
-    return target_beside(run.folder / "test" / f"{view}_compare.png", render)

@@ -34,21 +34,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # Whoever started this process holds the other end; when it dies, however it dies, the pipe ends.
         threading.Thread(target=_stop_with_input, name="input", daemon=True).start()
     # After the thread has started: these take seconds, in which a parent may die.
-    import torch
-
     from gridreg.ablation.database import DiskFullError
-    from gridreg.ablation.runners import serve
+    from gridreg.ablation.runners import InProcess
     from gridreg.ablation.store import Store
     from gridreg.errors import InputError
     from gridreg.fields import import_modules
 
     try:
-        torch.set_num_threads(max(1, options.threads))
         store = Store.open(options.store, create=False)
         study = store.study(options.study)
         import_modules(study.modules, study.name)
-        keep, device = not options.no_checkpoints, options.device
-        serve(store, study, lambda event: None, keep_checkpoints=keep, log=True, device=device)
+        runner = InProcess(max(1, options.threads), not options.no_checkpoints, options.device, log=True)
+        runner.run(store, study, lambda event: None)
     except KeyboardInterrupt:
         return 130
     except InputError as error:
