@@ -140,6 +140,9 @@ class Regularizer:
         train_only: skip `transform` while the module that owns the tensor is in eval mode.
         shown: the field whose number stands in tables and curves.
         ranges: lowest and highest value of fields that are numbers or schedules; None is let through.
+        counts: fields that are ints above 0 (or None, where that is the default), with what each is in words.
+        required: attributes of the samples that `penalty` reads and that a renderer may leave out (None).
+        example_arguments: what instances for `gridreg.testing.check_regularizer` are made with, beside the site.
 
     Two fields have a meaning where a subclass has them: `weight` is the factor of its penalties, and
     `detach=True` says that `transform` leaves values as they are and changes only gradients.
@@ -149,6 +152,9 @@ class Regularizer:
     train_only: ClassVar[bool] = False
     shown: ClassVar[str] = "weight"
     ranges: ClassVar[Mapping[str, tuple[float, float]]] = {}
+    counts: ClassVar[Sequence[tuple[str, str]]] = ()
+    required: ClassVar[tuple[str, ...]] = ()
+    example_arguments: ClassVar[Sequence[Mapping[str, Any]]] = ()
 
     def __post_init__(self) -> None:
         """Refuse at once what can be refused before the first step.
@@ -165,6 +171,11 @@ class Regularizer:
         for name, (low, high) in self.ranges.items():
             if getattr(self, name) is not None:
                 check_numeric(name, getattr(self, name), low, high)
+        for name, expected in self.counts:
+            value = getattr(self, name)
+            unset = value is None and known[name].default is None
+            if not unset and (isinstance(value, bool) or not hasattr(value, "__index__") or value < 1):
+                raise InputError(f"{name}={value!r}: expected {expected}")
         for name, choices in choices_of(type(self)).items():  # type: ignore[arg-type]
             if getattr(self, name) not in choices:
                 *first, last = map(repr, choices)
@@ -173,8 +184,6 @@ class Regularizer:
     def now(self, name: str, context: Context) -> float:
         """The number that a field stands for at the context's step; refused outside its range."""
         return context.at(getattr(self, name), name, *self.ranges.get(name, (-float("inf"), float("inf"))))
-
-    # --- where -------------------------------------------------------------------------------------
 
     def sites(self) -> tuple[SiteLike, ...]:
         """Sites that it attaches to or reads; by default the field `site`, or none."""
@@ -209,7 +218,7 @@ class Regularizer:
 
     def needs(self) -> tuple[str, ...]:
         """Attributes of the samples that `penalty` reads and that a renderer may leave out (None)."""
-        return ()
+        return self.required
 
     def penalty(self, samples: RaySamples, context: Context) -> Tensor:
         """Scalar from the samples of a batch, without the weight."""
@@ -257,7 +266,8 @@ class Regularizer:
     @classmethod
     def examples(cls, site: SiteLike) -> list[Regularizer]:
         """Instances for `gridreg.testing.check_regularizer`, at `site` where the class takes one."""
-        return []
+        place = {"site": site} if "site" in cls.__dataclass_fields__ else {}
+        return [cls(**place, **arguments) for arguments in cls.example_arguments]
 
 
 RegularizerClass = TypeVar("RegularizerClass", bound=type[Regularizer])

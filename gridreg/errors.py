@@ -8,7 +8,16 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-__all__ = ["RENAMED", "ConfigError", "InputError", "KeyPath", "near_names", "one_line", "silenced"]
+__all__ = [
+    "RENAMED",
+    "RENAMED_KEYS",
+    "ConfigError",
+    "InputError",
+    "KeyPath",
+    "near_names",
+    "one_line",
+    "silenced",
+]
 
 RENAMED = {
     "Distortion": "DistortionLoss",
@@ -16,6 +25,9 @@ RENAMED = {
     "SpatialAnnealing": "GridBlur",
 }
 """Names that went, with those that took their place: found in files and programs from before."""
+
+RENAMED_KEYS = {"pool_weight": "merge_weight", "faint_gradient": "stochastic_rounding"}
+"""Keys of configurations that went, with those that took their place."""
 
 KeyPath = tuple[str | int, ...]
 """Keys and list indices from the top of plain data to a value in it, such as ``("train", "steps")``."""

@@ -41,7 +41,7 @@ class RaySamples:
         index: ``(N,)`` int64, number of the sample on its ray counted from the ray's entry into the box,
             skipped ones included.
         density: ``(N,)`` per world unit.
-        weights: ``(N,)`` share of the pixel's colour that comes from the sample.
+        weights: ``(N,)`` fraction of the pixel's colour that comes from the sample.
         positions: ``(N, 3)`` world coordinates, or None.
         colours: ``(N, 3)`` in [0, 1], 0 where not evaluated, or None.
         directions: ``(R, 3)`` unit vectors, or None.

@@ -24,8 +24,8 @@ set:
   train.filter_rays_at: []
   train.occupancy_resolution: 12
   train.carve: false
-  train.pool_weight: 0.0
-  train.faint_gradient: 0.0
+  train.merge_weight: 0.0
+  train.stochastic_rounding: 0.0
   field.width: 8
   field.density_components: 4
   field.appearance_components: 4

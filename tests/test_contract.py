@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -196,3 +198,21 @@ class Product(gridreg.Mask):
 
     def rank_values(self, count: int, context: Context) -> Tensor:
         return torch.tensor(self.factors)
+
+
+def test_the_guide_for_contributors_adds_a_regularizer(registered: Any) -> None:
+    text = (Path(__file__).parent.parent / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    exec(compile(code, "CONTRIBUTING.md", "exec"), {"__name__": __name__})
+    assert check_regularizer(REGISTRY["MeanSquare"]) == 2
+
+
+def test_counts_are_ints_above_zero() -> None:
+    for arguments in ({"block": 0}, {"block": True}, {"block": 1.5}):
+        with pytest.raises(
+            gridreg.InputError, match=r"block=.*: expected a number of channels, an int above 0"
+        ):
+            gridreg.FrequencyMask("density", **arguments)
+    assert gridreg.FrequencyMask("density", block=None).block is None
+    with pytest.raises(gridreg.InputError, match="features=None: expected channels per level"):
+        gridreg.LevelMask("levels", features=None)

@@ -35,7 +35,7 @@ SETTINGS = TrainSettings(
     filter_rays_at=(3,),
     carve=True,
     step_ratio=2.0,
-    pool_weight=0.01,
+    merge_weight=0.01,
     average_from=0.5,
 )
 

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 import torch
 from torch import nn
 
 import gridreg
 from gridreg.errors import InputError
+from gridreg.export.cameras import look_at
 from gridreg.export.pace import Pace
 from gridreg.export.preview import Preview
+from gridreg.rendering.cameras import Camera, Lens
 from gridreg.rendering.model import Model
 from tests.export_fields import MaskedBall, ball_model
 
@@ -125,3 +130,40 @@ class TestPace:
         before = pace.moving(10_000, 1.0)
         pace.saw(0, 3.0)
         assert pace.moving(10_000, 1.0) == before
+
+
+#: From the x axis: y to the right, z up.
+CAMERA = Camera(
+    look_at(np.array([3.0, 0, 0]), np.zeros(3), np.array([0.0, 0, 1])), Lens.from_angle(40, 32, 32)
+)
+HALF = np.array([[-9.0, 0, -9], [9, 9, 9]])
+
+
+def test_a_box_cuts_what_is_rendered():
+    preview = Preview(ball_model(step=100))
+    whole = preview.at().render(CAMERA)
+    assert bool((whole.opacity[16, [11, 21]] > 0.99).all())
+    half = preview.at(crop=HALF).render(CAMERA)
+    assert bool((half.opacity[:, :16] == 0).all())
+    assert bool((half.colour[:, :16] == 1).all())
+    torch.testing.assert_close(half.opacity[:, 17:], whole.opacity[:, 17:], atol=0.02, rtol=0)
+    # Cut across, it begins later.
+    back = preview.at(crop=np.array([[-9.0, -9, -9], [0, 9, 9]])).render(CAMERA)
+    assert whole.depth[16, 16] == pytest.approx(2.4, abs=0.05)
+    assert back.depth[16, 16] == pytest.approx(3.0, abs=0.05)
+    nothing = preview.at(crop=np.array([[5.0, 5, 5], [6, 6, 6]])).render(CAMERA)
+    assert bool((nothing.opacity == 0).all())
+    # What is set for one image is not left behind.
+    assert torch.equal(preview.at().render(CAMERA).opacity, whole.opacity)
+
+
+def test_a_box_cuts_the_members_of_an_ensemble():
+    members = tuple(replace(ball_model(step=step), handle=None) for step in (100, 100))
+    with torch.no_grad():
+        members[0].field.weight.mul_(0.5)
+    preview = Preview(replace(ball_model(step=100), members=members))
+    whole = preview.at().render(CAMERA, deviation=True).deviation
+    half = preview.at(crop=HALF).render(CAMERA, deviation=True).deviation
+    assert bool((whole[16, [11, 21]] > 0.1).all())
+    assert bool((half[:, :16] == 0).all())
+    torch.testing.assert_close(half[16, 21], whole[16, 21], atol=0.02, rtol=0)

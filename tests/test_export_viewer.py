@@ -214,7 +214,7 @@ class TestDrawing:
 
         viewer, client = self.start()
         with viewer:
-            viewer._wish(client)
+            viewer._ask(viewer._save, client)
             name, content = until(lambda: client.files)[0]
             assert name.startswith("gridreg_rgb_")
             assert name.endswith(".png")
@@ -245,7 +245,7 @@ class TestDrawing:
             panel._size.value = -5
             assert panel.look.size == 64
             for _ in range(5):
-                viewer._wish(client)
+                viewer._ask(viewer._save, client)
             assert len(viewer._wishes) <= 1
 
     def test_training_views_are_there_to_click(self):
@@ -277,4 +277,19 @@ class TestCropBox:
             crop._save(SimpleNamespace(client=None))
             assert load_crop([str(path)]).tolist() == [[9, -1, 0], [11, 1, 1]]
             crop.shown.value = False
-            until(lambda: crop._lines is None)
+            until(lambda: crop._lines is None and crop.inner is None)
+
+    def test_it_cuts_what_a_browser_is_sent(self, tmp_path):
+        client, world = FakeClient(FRONT), World((0.0, 0.0, 0.0), 1.0)
+        with Viewer(ball_model(step=100), port=0, quiet=True) as viewer:
+            crop = viewer.offer_crop(tmp_path / "crop.json", torch.tensor([[-1.0] * 3, [1.0] * 3]), world)
+            viewer._connected(client)
+            whole = until(lambda: [image for image in client.images if image.shape[1] == 80])[-1]
+            assert (whole[30, [30, 50]] < 250).any(axis=1).all()
+            crop.low.value, crop.shown.value = (-1.0, 0.0, -1.0), True
+            cut = until(lambda: [i for i in client.images if i.shape[1] == 80 and (i[:, :39] > 250).all()])[
+                -1
+            ]
+            assert (cut[30, 50] < 250).any()
+            crop.shown.value = False
+            until(lambda: np.array_equal(client.images[-1], whole))

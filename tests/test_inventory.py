@@ -19,6 +19,7 @@ RENAMED: dict[str, dict[str, str]] = {
     "regularizers": gridreg.errors.RENAMED,
     # Another name of the same regularizers.
     "compositions": {"few_tensorf_finetuned": "few_tensorf"},
+    "configuration": {f"train.{old}": f"train.{new}" for old, new in gridreg.errors.RENAMED_KEYS.items()},
     # A positional argument, whose name is only shown.
     "options": {"prepare.pictures": "prepare.images"},
 }

@@ -8,8 +8,10 @@ import torch
 
 import gridreg
 from gridreg.base import overrides
+from gridreg.errors import ConfigError
 from gridreg.scenes import builtin_scene, load_scene
 from gridreg.training import (
+    RunConfig,
     TrainOptions,
     build_trainer,
     configure,
@@ -17,6 +19,8 @@ from gridreg.training import (
     preset_names,
     regularizers_of,
 )
+from gridreg.training.config import override
+from gridreg.training.typed_data import from_data
 
 PENALTIES = ("penalty", "grid_penalty")
 OPTIMIZER = ("parameter_groups", "update_groups")
@@ -197,3 +201,13 @@ def test_finetuned_is_the_published_schedule_with_four_changes():
     ]
     assert ours.composition == [*left, {"name": "RandomBackground"}]
     assert len(left) == len(published.composition) - 3
+
+
+def test_keys_of_before_are_refused_with_their_names_of_now():
+    for old, new in gridreg.errors.RENAMED_KEYS.items():
+        with pytest.raises(
+            ConfigError, match=rf"train\.{old}: unknown key; it is called {new} now\. valid: steps, "
+        ):
+            from_data(RunConfig, {"scene": "builtin", "train": {old: 0.1}})
+        with pytest.raises(ConfigError, match=rf"set: train\.{old}: unknown key; it is called {new} now"):
+            override(RunConfig(scene="builtin"), {f"train.{old}": 0.1}, source="set")

@@ -134,17 +134,20 @@ class HandleParts:
 
     def _bindings(self, *methods: Callable[..., object]) -> list[Binding]:
         """Bindings whose regularizers override one of these methods, noted as asked; all without any."""
-        self._require_applied()
+        bindings = self._live.bindings
         if not methods:
-            return self._attachment.bindings
-        found = [binding for binding in self._attachment.bindings if binding.overrides(*methods)]
+            return bindings
+        found = [binding for binding in bindings if binding.overrides(*methods)]
         for binding in found:
             binding.asked = True
         return found
 
-    def _require_applied(self) -> None:
+    @property
+    def _live(self) -> Attachment:
+        """The attachment; refused once the handle was removed."""
         if self._attachment.removed:
             raise InputError("handle: it was removed; call gridreg.apply again for a new one")
+        return self._attachment
 
 
 def _weight(binding: Binding) -> float:

@@ -52,11 +52,11 @@ class Handle(HandleParts):
         Raises:
             InputError: not a number from 0, or a schedule gives a value out of range at this step.
         """
-        self._require_applied()
+        attachment = self._live
         if isinstance(step, bool) or not hasattr(step, "__index__") or step < 0:
             raise InputError(f"step={step!r}: expected a number of iterations from 0")
-        self._attachment.clock.step = int(step)
-        self._attachment.refresh()
+        attachment.clock.step = int(step)
+        attachment.refresh()
 
     # --- suspending and removing -----------------------------------------------------------------
 
@@ -70,8 +70,7 @@ class Handle(HandleParts):
         Raises:
             InputError: on leaving, a site is no longer there; what else can be attached again is.
         """
-        self._require_applied()
-        with self._attachment.suspended():
+        with self._live.suspended():
             yield self
 
     def suspends(self, method: str) -> Handle:
@@ -87,8 +86,7 @@ class Handle(HandleParts):
         Raises:
             InputError: there is no such method; near names are listed.
         """
-        self._require_applied()
-        self._attachment.suspends(method)
+        self._live.suspends(method)
         return self
 
     @contextmanager
@@ -97,8 +95,7 @@ class Handle(HandleParts):
 
         Reads with gradients never do: a parameter is transformed once between two steps or backward passes.
         """
-        self._require_applied()
-        stacks = self._attachment.stacks()
+        stacks = self._live.stacks()
         for stack in stacks:
             stack.forget()
             stack.keep += 1
@@ -115,8 +112,7 @@ class Handle(HandleParts):
         Raises:
             InputError: the copy lacks a site of the field, or has other channels there.
         """
-        self._require_applied()
-        self._attachment.follow(copy)
+        self._live.follow(copy)
         return self
 
     def bake(self) -> None:
@@ -127,8 +123,7 @@ class Handle(HandleParts):
         Raises:
             InputError: an output or input of a module is transformed, which no parameter can hold.
         """
-        self._require_applied()
-        self._attachment.bake()
+        self._live.bake()
 
     def remove(self) -> None:
         """Take everything off: the field is what it would be without.
@@ -136,11 +131,10 @@ class Handle(HandleParts):
         Raises:
             InputError: removed before.
         """
-        self._require_applied()
-        self._attachment.remove()
+        self._live.remove()
 
     def __enter__(self) -> Handle:
-        self._require_applied()
+        self._bindings()
         return self
 
     def __exit__(
@@ -153,14 +147,14 @@ class Handle(HandleParts):
 
     def state_dict(self) -> dict[str, Any]:
         """The step, the random state and what the regularizers remember: numbers, text and tensors."""
-        self._require_applied()
-        clock = self._attachment.clock
+        attachment = self._live
+        clock = attachment.clock
         return {
             "step": clock.step,
             "total_steps": clock.total_steps,
-            "regularizers": [binding.name for binding in self._attachment.bindings],
+            "regularizers": attachment.names(),
             "generator": clock.generator.get_state(),
-            "state": self._attachment.state(),
+            "state": attachment.state(),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -169,7 +163,6 @@ class Handle(HandleParts):
         Raises:
             InputError: the state is of other regularizers, another run length, or other tensors.
         """
-        self._require_applied()
         own = self.state_dict()
         missing = sorted(set(own) - set(state))
         if missing:
@@ -206,7 +199,6 @@ class Handle(HandleParts):
         Raises:
             InputError: matplotlib is not installed, or nothing follows the step.
         """
-        self._require_applied()
         panels: list[tuple[str, Callable[[Any], Any]]] = []
         for binding in self._bindings():
             regularizer, place = binding.regularizer, binding.slots[0][0].place if binding.slots else None

@@ -26,7 +26,7 @@ class MeshOptions:
     threshold: OptionalFloat = None
     """Density at the surface, per world unit; default: follows from the field."""
     min_component: float = 0.01
-    """Parts with less surface than this share of the largest part's are dropped; 0 keeps all."""
+    """Parts with less surface than this fraction of the largest part's are dropped; 0 keeps all."""
     faces: OptionalInt = None
     """At most so many faces, such as 100000; default: as many as the resolution gives."""
     texture: OptionalInt = None

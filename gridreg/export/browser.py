@@ -160,11 +160,11 @@ def add_frustums(
     return found
 
 
-def place_camera(server: Any, orbit: Orbit, share: float, angle: float) -> None:
-    """Set the first camera of every browser: on an orbit, a share of its radius away, an angle of view in radians."""
+def place_camera(server: Any, orbit: Orbit, fraction: float, angle: float) -> None:
+    """Set the first camera of every browser: on an orbit, a fraction of its radius away, the angle of view in rad."""
     server.scene.set_up_direction(tuple(float(v) for v in orbit.up))
     camera, place = server.initial_camera, orbit.pose(0.0).double().numpy()[:3, 3]
-    camera.position = orbit.centre + share * (place - orbit.centre)
+    camera.position = orbit.centre + fraction * (place - orbit.centre)
     camera.look_at, camera.up, camera.fov = orbit.centre, orbit.up, angle
 
 

@@ -18,7 +18,7 @@ __all__ = ["check_faces", "decimate"]
 Vertices = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-# Share of the way to their own neighbours that copies of a vertex move, so that nobody who merges joins them again.
+# Copies of a vertex move so far to their own neighbours, relative to the distance: who merges does not join them again.
 _APART = 1e-3
 _ATTEMPTS = 16
 

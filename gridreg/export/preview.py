@@ -7,7 +7,10 @@ from collections.abc import Collection
 from dataclasses import replace
 from typing import Any
 
-from torch import nn
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
 
 import gridreg
 from gridreg import Handle, Regularizer
@@ -66,12 +69,15 @@ class Preview:
         """True if rays are mapped before they are marched, see `Model`."""
         return self._model.warp is not None
 
-    def at(self, step: int | None = None, off: Collection[str] = ()) -> Model:
-        """The model as it would be at a step, with some masks taken off.
+    def at(
+        self, step: int | None = None, off: Collection[str] = (), crop: NDArray[np.float64] | None = None
+    ) -> Model:
+        """The model as it would be at a step, with some masks taken off, inside a box.
 
         Args:
             step: iteration from 0; None: the one at which the copy was made.
             off: names out of `masks`; others are ignored.
+            crop: ``(2, 3)`` in the field's coordinates: the background is seen where it ends; None: all there is.
 
         Returns:
             A model, valid until the next call.
@@ -84,7 +90,26 @@ class Preview:
             self._attached = gridreg.apply(self._model.field, *acting, total_steps=self.total_steps)
             self._attached.step(wanted[0])
             self._shown = wanted
-        return self._model
+        return self._model if crop is None else _cropped(self._model, torch.from_numpy(crop))
+
+
+class _Cropped:
+    """A field whose rays begin and end at a smaller box."""
+
+    def __init__(self, field: Any, bounds: Tensor) -> None:
+        self._field, self.bounds = field, bounds
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._field, name)
+
+
+def _cropped(model: Model, box: Tensor) -> Model:
+    low, high = model.field.bounds
+    low, high = torch.maximum(box[0].to(low), low), torch.minimum(box[1].to(high), high)
+    # A box beside the field's holds nothing: it has no volume.
+    field = _Cropped(model.field, torch.stack([low, torch.maximum(low, high)]))
+    members = tuple(_cropped(member, box) for member in model.members)
+    return replace(model, field=field, surroundings=None, members=members)
 
 
 def _copied(field: Any) -> Any:

@@ -85,7 +85,8 @@ class Viewer:
         self._wishes: list[tuple[Callable[[Any], None], Any]] = []
         self._closed = False
         self._pace = Pace()
-        act = (self._touch, self._wish)
+        self._crop: CropControls | None = None
+        act = (self._touch, partial(self._ask, self._save))
         self._panel = Panel(self._server, self._preview, *act, size, pausable=pausable)
         self.curve = self._panel.curve
         self._stand(model, views)
@@ -139,8 +140,9 @@ class Viewer:
             self._server.stop()
 
     def offer_crop(self, path: Path, bounds: Tensor, world: World) -> CropControls:
-        """Add controls for a box, which are saved to a file that ``gridreg mesh --crop`` takes."""
-        return CropControls(self._server, bounds, world, path)
+        """Add controls for a box that cuts what is seen, saved to a file that ``gridreg mesh --crop`` takes."""
+        self._crop = CropControls(self._server, bounds, world, path, self._touch)
+        return self._crop
 
     @property
     def watched(self) -> bool:
@@ -200,9 +202,6 @@ class Viewer:
             for screen in screens or tuple(self._screens.values()):
                 screen.wanted += 1
             self._news.notify_all()
-
-    def _wish(self, client: Any) -> None:
-        self._ask(self._save, client)
 
     def _ask(self, action: Callable[[Any], None], of: Any) -> None:
         with self._news:
@@ -277,9 +276,9 @@ class Viewer:
         def given_up() -> bool:
             return self._closed or (screen is not None and screen.wanted != wanted)
 
-        return self._preview.at(look.step, look.off).render(
-            camera, stop=given_up, deviation=look.mode == "deviation"
-        )
+        crop = None if self._crop is None else self._crop.inner
+        model = self._preview.at(look.step, look.off, crop)
+        return model.render(camera, stop=given_up, deviation=look.mode == "deviation")
 
     def _compare(self, number: int) -> None:
         """Show the render of a training view beside its photograph."""

@@ -8,7 +8,6 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from gridreg.attach.sites import SiteLike
 from gridreg.base import NOT_NEGATIVE, Context, Regularizer, register, within
 from gridreg.errors import InputError
 from gridreg.samples import RaySamples
@@ -100,6 +99,7 @@ class RandomBackground(Regularizer):
     per: Literal["ray", "batch"] = "ray"
     until: Numeric = 1.0
     ranges = within(until=NOT_NEGATIVE)
+    example_arguments = ({}, {"per": "batch", "until": 0.5})
 
     def background(
         self, count: int, generator: torch.Generator, default: Tensor | None, context: Context
@@ -113,11 +113,6 @@ class RandomBackground(Regularizer):
     def value(self, context: Context) -> float:
         """1 while backgrounds are random."""
         return float(context.step < context.end(self.until))
-
-    @classmethod
-    def examples(cls, site: SiteLike) -> list[Regularizer]:
-        """For each ray, and for the whole batch until half-way."""
-        return [cls(), cls(per="batch", until=0.5)]
 
 
 @register
@@ -144,10 +139,8 @@ class ExpectedBackground(Regularizer):
     weight: Numeric = 1.0
     until: Numeric = 1.0
     ranges = within(until=NOT_NEGATIVE)
-
-    def needs(self) -> tuple[str, ...]:
-        """The alpha of the pixels."""
-        return ("target_opacity",)
+    required = ("target_opacity",)
+    example_arguments = ({}, {"weight": 3.0, "until": 0.5})
 
     def penalty(self, samples: RaySamples, context: Context) -> Tensor:
         """`opacity_error` by the variance of a uniform colour; 0 from the end on."""
@@ -165,8 +158,3 @@ class ExpectedBackground(Regularizer):
     def value(self, context: Context) -> float:
         """The weight while backgrounds are grey."""
         return super().value(context) if context.step < context.end(self.until) else 0.0
-
-    @classmethod
-    def examples(cls, site: SiteLike) -> list[Regularizer]:
-        """In expectation, and stronger until half-way."""
-        return [cls(), cls(weight=3.0, until=0.5)]

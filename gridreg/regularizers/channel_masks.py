@@ -8,9 +8,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from gridreg.attach.sites import Place, SiteLike
-from gridreg.base import Context, Regularizer, register, within
-from gridreg.errors import InputError
+from gridreg.attach.sites import Place
+from gridreg.base import Context, register, within
 from gridreg.regularizers import mask_functions as masks
 from gridreg.regularizers.mask_base import Mask
 from gridreg.schedules import Linear, Numeric
@@ -43,12 +42,14 @@ class FrequencyMask(Mask):
     until: Numeric = 0.9
     block: int | None = None
     variant: Literal["block", "printed", "authors"] = "block"
-
-    def __post_init__(self) -> None:
-        """Refuse what no run could use."""
-        super().__post_init__()
-        if self.block is not None and (isinstance(self.block, bool) or not self.block >= 1):
-            raise InputError(f"block={self.block!r}: expected a number of channels, an int above 0, or None")
+    counts = (("block", "a number of channels, an int above 0, or None"),)
+    example_arguments = (
+        {"until": 0.9},
+        {"until": 7, "block": 2},
+        {"until": 0.5, "detach": True},
+        {"variant": "authors"},
+        {"variant": "printed"},
+    )
 
     def ranks(self, place: Place) -> tuple[int, ...]:
         """By octave where known; the variants know only the index."""
@@ -79,26 +80,15 @@ class FrequencyMask(Mask):
         """Not in the printed form."""
         return self.variant != "printed"
 
-    @classmethod
-    def examples(cls, site: SiteLike) -> list[Regularizer]:
-        """Instances for the contract suite."""
-        return [
-            cls(site, until=0.9),
-            cls(site, until=7, block=2),
-            cls(site, until=0.5, detach=True),
-            cls(site, variant="authors"),
-            cls(site, variant="printed"),
-        ]
-
 
 @register
 @dataclass(frozen=True)
 class FixedMask(Mask):
-    """The lowest share of the channels (of the octaves, where known) stays open, the rest closed.
+    """The lowest fraction of the channels (of the octaves, where known) stays open, the rest closed.
 
     Args:
         site: where it acts.
-        visible_ratio: open share, in [0, 1]: the first `int(channels * visible_ratio)`.
+        visible_ratio: open fraction, in [0, 1]: the first `int(channels * visible_ratio)`.
         detach: closed channels keep their values and only lose their gradient.
 
     Formula: the first ``int(L visible_ratio)`` channels 1, the rest 0
@@ -108,19 +98,11 @@ class FixedMask(Mask):
 
     visible_ratio: Numeric = 0.8
     ranges = within(visible_ratio=(0.0, 1.0))
+    example_arguments = ({}, {"visible_ratio": 0.5, "detach": True}, {"visible_ratio": Linear(0.3, 1.0)})
 
     def rank_values(self, count: int, context: Context) -> Tensor:
         """Mask over ranks."""
         return masks.fixed_mask(count, self.now("visible_ratio", context))
-
-    @classmethod
-    def examples(cls, site: SiteLike) -> list[Regularizer]:
-        """Instances for the contract suite."""
-        return [
-            cls(site),
-            cls(site, visible_ratio=0.5, detach=True),
-            cls(site, visible_ratio=Linear(0.3, 1.0)),
-        ]
 
 
 @register
@@ -142,6 +124,7 @@ class CosineMask(Mask):
     """
 
     until: Numeric = 0.9
+    example_arguments = ({}, {"until": 5}, {"detach": True})
 
     def ranks(self, place: Place) -> tuple[int, ...]:
         """By octave where known; rank 0 is the identity's, whether or not the site has it."""
@@ -154,8 +137,3 @@ class CosineMask(Mask):
             return torch.ones(1)
         window = masks.cosine_mask(count - 1, context.step, context.end(self.until))
         return torch.cat([torch.ones(1), window])
-
-    @classmethod
-    def examples(cls, site: SiteLike) -> list[Regularizer]:
-        """Instances for the contract suite."""
-        return [cls(site), cls(site, until=5), cls(site, detach=True)]

@@ -8,7 +8,6 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from gridreg.attach.sites import SiteLike
 from gridreg.base import NOT_NEGATIVE, Context, Regularizer, register, within
 from gridreg.errors import InputError
 from gridreg.samples import RaySamples
@@ -89,7 +88,7 @@ def depth_residual(samples: RaySamples) -> Tensor:
 def depth_ranking(samples: RaySamples, offset: float = 0.5, margin: float = 1e-4) -> Tensor:
     """Mean of ``max(0, d_near - d_far + margin)`` over pairs of rays, one nearer than the other by its target.
 
-    In each image the rays are ordered by their target, and each is paired with the one that stands a share `offset`
+    In each image the rays are ordered by their target, and each is paired with the one that stands a fraction `offset`
     of the image's rays behind it, round about; pairs of equal targets do not count.
 
     Args:
@@ -147,10 +146,8 @@ class DepthPrior(Regularizer):
     form: Literal["pearson", "ranking", "scale_shift"] = "pearson"
     margin: Numeric = 1e-4
     ranges = within(margin=NOT_NEGATIVE)
-
-    def needs(self) -> tuple[str, ...]:
-        """The depth to compare with."""
-        return ("target_depth",)
+    required = ("target_depth",)
+    example_arguments = ({}, {"form": "ranking"}, {"form": "scale_shift"})
 
     def penalty(self, samples: RaySamples, context: Context) -> Tensor:
         """The form's function; pairs of the ranking change with the step."""
@@ -158,8 +155,3 @@ class DepthPrior(Regularizer):
             offset = float(torch.rand((), generator=context.step_generator()))
             return depth_ranking(samples, offset, self.now("margin", context))
         return depth_correlation(samples) if self.form == "pearson" else depth_residual(samples)
-
-    @classmethod
-    def examples(cls, site: SiteLike) -> list[Regularizer]:
-        """Every form."""
-        return [cls(), cls(form="ranking"), cls(form="scale_shift")]

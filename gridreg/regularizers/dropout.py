@@ -63,6 +63,7 @@ class ComponentDropout(Regularizer):
     p: Numeric = _RAMP
     shown = "p"
     ranges = within(p=(0.0, _HIGHEST))
+    example_arguments = ({}, {"p": 0.5}, {"p": 0.0})
 
     def prepare(self, context: Context) -> None:
         """Draw the factors of this step."""
@@ -80,8 +81,3 @@ class ComponentDropout(Regularizer):
         """Multiply the channels by their factors."""
         factors = broadcast(context, "factors", value)
         return torch.where(factors > 0, value * factors, 0.0)
-
-    @classmethod
-    def examples(cls, site: SiteLike) -> list[Regularizer]:
-        """Instances for the contract suite."""
-        return [cls(site), cls(site, p=0.5), cls(site, p=0.0)]

@@ -19,7 +19,7 @@ Boundary: TypeAlias = Literal["periodic", "mirror"]
 
 _CHANNELS_LAST = ((4, torch.channels_last), (5, torch.channels_last_3d))
 
-# A response below this share leaves nothing that float32 could see next to the rest of the spectrum.
+# A response below this fraction leaves nothing that float32 could see next to the rest of the spectrum.
 _NOTHING = 1e-8
 
 
@@ -29,10 +29,10 @@ def low_pass_response(frequencies: Tensor, highest: int, keep: float | Tensor) -
     Args:
         frequencies: numbers of the frequencies, from 0, any shape.
         highest: number of the highest frequency.
-        keep: share of the spectrum in [0, 1]; frequency 0, the mean, has factor 1 at any share.
+        keep: fraction of the spectrum in [0, 1]; frequency 0, the mean, has factor 1 at any fraction.
 
     Returns:
-        In [0, 1], shape of `frequencies`; all ones at ``keep=1``, and nowhere lower for a larger share.
+        In [0, 1], shape of `frequencies`; all ones at ``keep=1``, and nowhere lower for a larger fraction.
 
     Example:
         >>> low_pass_response(torch.arange(5), 4, 0.375)
@@ -44,12 +44,12 @@ def low_pass_response(frequencies: Tensor, highest: int, keep: float | Tensor) -
 def fourier_low_pass(
     values: Tensor, axes: Sequence[int], keep: float | Tensor, boundary: Boundary = "periodic"
 ) -> Tensor:
-    """Keep the lowest share of the frequencies along each axis.
+    """Keep the lowest fraction of the frequencies along each axis.
 
     Args:
         values: a grid, any shape.
         axes: its spatial axes.
-        keep: share of the spectrum that stays, in [0, 1]: at 0 only the mean, at 1 the values themselves. A
+        keep: fraction of the spectrum that stays, in [0, 1]: at 0 only the mean, at 1 the values themselves. A
             scalar tensor is not checked, and costs more; compiled code need not be compiled anew for it.
         boundary: "periodic" is the discrete Fourier transform, where opposite borders are neighbours;
             "mirror" the cosine transform, where the grid is continued by its mirror image.
@@ -82,7 +82,7 @@ def gaussian_blur(values: Tensor, axes: Sequence[int], radius: float | Tensor) -
     Args:
         values: a grid, any shape.
         axes: its spatial axes.
-        radius: standard deviation as a share of the grid's edge: ``n - 1`` voxels times it on an axis of `n`
+        radius: standard deviation as a fraction of the grid's edge: ``n - 1`` voxels times it on an axis of `n`
             nodes, so that it means the same length after the grid has grown. A scalar tensor is not checked.
 
     Returns:
@@ -146,10 +146,10 @@ def _gaussian_factors(size: int, radius: float) -> tuple[Tensor, ...]:
 
 
 def _factors(basis: Tensor, response: Tensor) -> tuple[Tensor, ...]:
-    """The filter as one matrix, or, if few frequencies pass, as two thin ones: analysis and synthesis."""
+    """The filter as one matrix, or, if few frequencies pass, as two narrow ones: analysis and synthesis."""
     passing = response > _NOTHING
-    thin = basis[passing] * response[passing].sqrt()[:, None]
-    return (thin.T @ thin,) if 2 * thin.shape[0] > thin.shape[1] else (thin, thin.T)
+    analysis = basis[passing] * response[passing].sqrt()[:, None]
+    return (analysis.T @ analysis,) if 2 * len(analysis) > analysis.shape[1] else (analysis, analysis.T)
 
 
 def _whole(basis: Tensor, response: Tensor) -> tuple[Tensor, ...]:
@@ -168,7 +168,7 @@ def _filter(values: Tensor, axes: Sequence[int], factors_of: Callable[[int], tup
     with torch.autocast(device, enabled=False) if torch.amp.is_autocast_available(device) else nullcontext():
         for axis in axes:
             first, *second = factors_of(values.shape[axis])
-            # Thin factors first on all axes: each makes the grid smaller for the next.
+            # Narrow factors first on all axes: each makes the grid smaller for the next.
             syntheses += [(matrix, axis) for matrix in second]
             values = _along(first, values, axis)
         for matrix, axis in reversed(syntheses):

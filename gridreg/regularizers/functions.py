@@ -114,6 +114,10 @@ class SamplesFunction(_FunctionPenalty):
 
     where: str = "samples"
     weight: Numeric = 1.0
+    example_arguments = (
+        {"function": "torch:square", "where": "samples.opacity"},
+        {"function": "gridreg.regularizers.density:cauchy_sparsity"},
+    )
 
     def __post_init__(self) -> None:
         """Refuse at once what can be refused before the first step."""
@@ -136,14 +140,6 @@ class SamplesFunction(_FunctionPenalty):
         attribute = self.where.partition(".")[2]
         return self._value(getattr(samples, attribute) if attribute else samples)
 
-    @classmethod
-    def examples(cls, site: SiteLike) -> list[Regularizer]:
-        """One of an attribute, and one of the whole samples."""
-        return [
-            cls("torch:square", "samples.opacity"),
-            cls("gridreg.regularizers.density:cauchy_sparsity"),
-        ]
-
 
 @register
 @dataclass(frozen=True)
@@ -165,12 +161,8 @@ class GridFunction(_FunctionPenalty):
 
     site: SiteLike = "density"
     weight: Numeric = 1.0
+    example_arguments = ({"function": "torch:square"},)
 
     def grid_penalty(self, grids: Sequence[Grid], context: Context) -> Tensor:
         """Mean of what the function returns, added over the grids."""
         return torch.stack([self._value(grid.values) for grid in grids]).sum()
-
-    @classmethod
-    def examples(cls, site: SiteLike) -> list[Regularizer]:
-        """The square of the values."""
-        return [cls("torch:square", site)]

@@ -8,7 +8,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gridreg.attach.sites import SiteLike
 from gridreg.base import NOT_NEGATIVE, Context, Regularizer, register, within
 from gridreg.errors import InputError
 from gridreg.samples import RaySamples
@@ -19,29 +18,22 @@ __all__ = ["DistanceGradientScaling", "scale_gradients_by_distance"]
 
 
 class _ScaledGradient(torch.autograd.Function):
-    """The identity, whose gradient is multiplied by a factor."""
+    """The value of one tensor with the gradient of another, times a factor."""
 
     @staticmethod
-    def forward(ctx: Any, values: Tensor, factor: Tensor) -> Tensor:
-        ctx.save_for_backward(factor)
-        return values.view_as(values)
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
-        (factor,) = ctx.saved_tensors
-        return gradients[0] * factor, None
-
-
-class _ValueOf(torch.autograd.Function):
-    """The value of one tensor with the gradient of another."""
-
-    @staticmethod
-    def forward(ctx: Any, value: Tensor, path: Tensor) -> Tensor:
+    def forward(ctx: Any, value: Tensor, path: Tensor, factor: Tensor | None) -> Tensor:
+        ctx.factor = factor
         return value.view_as(value)
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[None, Tensor]:
-        return None, gradients[0]
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[None, Tensor, None]:
+        return None, gradients[0] if ctx.factor is None else gradients[0] * ctx.factor, None
+
+
+def _scaled(path: Tensor, factor: Tensor | None, value: Tensor | None = None) -> Tensor:
+    """`path` with its gradient times a factor, or another value in its place."""
+    found: Tensor = _ScaledGradient.apply((path if value is None else value).detach(), path, factor)  # type: ignore[no-untyped-call]
+    return found
 
 
 def scale_gradients_by_distance(samples: RaySamples, distance: float = 1.0) -> RaySamples:
@@ -70,14 +62,11 @@ def scale_gradients_by_distance(samples: RaySamples, distance: float = 1.0) -> R
     if not distance > 0:
         raise InputError(f"distance={distance}: expected a length above 0")
     factor = (samples.t / distance).square().clamp(0, 1).detach()
-    density: Tensor = _ScaledGradient.apply(samples.density, factor)  # type: ignore[no-untyped-call]
+    density = _scaled(samples.density, factor)
     # Weights came from the unscaled density: derive them again for the gradient, and keep their values.
     path = optical_depth_to_weights(density * samples.delta, samples.offsets)
-    weights: Tensor = _ValueOf.apply(samples.weights.detach(), path)  # type: ignore[no-untyped-call]
-    colours = samples.colours
-    if colours is not None:
-        colours = _ScaledGradient.apply(colours, factor[:, None])  # type: ignore[no-untyped-call]
-    return samples.replace(density=density, weights=weights, colours=colours)
+    colours = None if samples.colours is None else _scaled(samples.colours, factor[:, None])
+    return samples.replace(density=density, weights=_scaled(path, None, samples.weights), colours=colours)
 
 
 @register
@@ -96,6 +85,7 @@ class DistanceGradientScaling(Regularizer):
     distance: Numeric = 1.0
     shown = "distance"
     ranges = within(distance=NOT_NEGATIVE)
+    example_arguments = ({}, {"distance": 5.0})
 
     def __post_init__(self) -> None:
         """Refuse at once what can be refused before the first step."""
@@ -106,8 +96,3 @@ class DistanceGradientScaling(Regularizer):
     def on_samples(self, samples: RaySamples, context: Context) -> RaySamples:
         """`scale_gradients_by_distance` with the distance of this step."""
         return scale_gradients_by_distance(samples, self.now("distance", context))
-
-    @classmethod
-    def examples(cls, site: SiteLike) -> list[Regularizer]:
-        """At its default, and farther."""
-        return [cls(), cls(distance=5.0)]

@@ -121,6 +121,7 @@ class L1(Regularizer):
 
     site: SiteLike
     weight: Numeric = 8e-5
+    example_arguments = ({},)
 
     def grid_penalty(self, grids: Sequence[Grid], context: Context) -> Tensor:
         """`l1`, added over the grids."""
@@ -129,11 +130,6 @@ class L1(Regularizer):
     def local_terms(self, grids: Sequence[Grid], context: Context) -> list[LocalTerm]:
         """One for each grid, if all of it takes part."""
         return _terms("l1", grids)
-
-    @classmethod
-    def examples(cls, site: SiteLike) -> list[Regularizer]:
-        """At its default."""
-        return [cls(site)]
 
 
 @register
@@ -155,6 +151,7 @@ class L2(Regularizer):
 
     site: SiteLike
     weight: Numeric = 1e-4
+    example_arguments = ({},)
 
     def grid_penalty(self, grids: Sequence[Grid], context: Context) -> Tensor:
         """`l2`, added over the grids."""
@@ -163,11 +160,6 @@ class L2(Regularizer):
     def local_terms(self, grids: Sequence[Grid], context: Context) -> list[LocalTerm]:
         """One for each grid, if all of it takes part."""
         return _terms("l2", grids)
-
-    @classmethod
-    def examples(cls, site: SiteLike) -> list[Regularizer]:
-        """At its default."""
-        return [cls(site)]
 
 
 def _terms(kind: Literal["l1", "l2"], grids: Sequence[Grid]) -> list[LocalTerm]:
@@ -202,6 +194,7 @@ class Orthogonality(Regularizer):
 
     site: SiteLike
     weight: Numeric = 0.01
+    example_arguments = ({},)
 
     def grid_penalty(self, grids: Sequence[Grid], context: Context) -> Tensor:
         """`orthogonality`, added over the lines."""
@@ -210,8 +203,3 @@ class Orthogonality(Regularizer):
         lines = [grid for grid in tabled if len(spatial_axes(grid, "Orthogonality")) == 1]
         rows = [row for grid in lines or tabled for row in _rows(grid)]
         return torch.stack([orthogonality(row) for row in rows]).sum()
-
-    @classmethod
-    def examples(cls, site: SiteLike) -> list[Regularizer]:
-        """At its default."""
-        return [cls(site)]

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gridreg.attach.sites import Place, SiteLike
-from gridreg.base import NOT_NEGATIVE, Context, Regularizer, register, within
+from gridreg.attach.sites import Place
+from gridreg.base import NOT_NEGATIVE, Context, register, within
 from gridreg.errors import InputError
 from gridreg.regularizers import mask_functions as masks
 from gridreg.regularizers.mask_base import Mask
@@ -43,6 +43,12 @@ class LevelMask(Mask):
     begin: Numeric = 0
     features: int = 2
     ranges = within(start=(1.0, float("inf")))
+    counts = (("features", "channels per level, an int above 0"),)
+    example_arguments = (
+        {"start": 1, "every": 3, "features": 1},
+        {"start": 2, "every": 0.05, "begin": 0.1, "features": 1},
+        {"start": 1, "every": 0.2, "features": 1, "detach": True},
+    )
 
     def __post_init__(self) -> None:
         """Refuse what no run could use."""
@@ -50,8 +56,6 @@ class LevelMask(Mask):
         check_until(self.every, "every")
         if self.begin != 0:
             check_until(self.begin, "begin")
-        if isinstance(self.features, bool) or not self.features >= 1:
-            raise InputError(f"features={self.features!r}: expected channels per level, an int above 0")
 
     def ranks(self, place: Place) -> tuple[int, ...]:
         """Level of each channel."""
@@ -75,15 +79,6 @@ class LevelMask(Mask):
         begin = 0 if self.begin == 0 else end_step(self.begin, 0, total_steps)
         missing = max(0, math.ceil(count - self.start))  # type: ignore[operator]
         return begin + missing * end_step(self.every, 0, total_steps)
-
-    @classmethod
-    def examples(cls, site: SiteLike) -> list[Regularizer]:
-        """Instances for the contract suite."""
-        return [
-            cls(site, start=1, every=3, features=1),
-            cls(site, start=2, every=0.05, begin=0.1, features=1),
-            cls(site, start=1, every=0.2, features=1, detach=True),
-        ]
 
 
 @register
@@ -111,14 +106,13 @@ class ViewDependenceMask(Mask):
     until: Numeric | None = None
     coefficients: int | None = None
     ranges = within(bands=NOT_NEGATIVE)
-
-    def __post_init__(self) -> None:
-        """Refuse what no run could use."""
-        super().__post_init__()
-        if self.coefficients is not None and (
-            isinstance(self.coefficients, bool) or not self.coefficients >= 1
-        ):
-            raise InputError(f"coefficients={self.coefficients!r}: expected coefficients per colour, or None")
+    counts = (("coefficients", "coefficients per colour, or None"),)
+    example_arguments = (
+        {"bands": 1},
+        {"bands": 0},
+        {"bands": 1, "until": 0.5},
+        {"bands": Linear(1, 10), "detach": True},
+    )
 
     def ranks(self, place: Place) -> tuple[int, ...]:
         """Band of each channel."""
@@ -131,13 +125,3 @@ class ViewDependenceMask(Mask):
         if self.until is not None and context.step >= context.end(self.until):
             return torch.ones(count)
         return (torch.arange(count) < math.floor(self.now("bands", context))).float()
-
-    @classmethod
-    def examples(cls, site: SiteLike) -> list[Regularizer]:
-        """Instances for the contract suite."""
-        return [
-            cls(site, bands=1),
-            cls(site, bands=0),
-            cls(site, bands=1, until=0.5),
-            cls(site, bands=Linear(1, 10), detach=True),
-        ]

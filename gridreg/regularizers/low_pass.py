@@ -30,13 +30,13 @@ def annealed_radius(
         step: current step, iterations.
         end: step from which the radius is `floor`, iterations. (With SANeRF's numbers the last round before
             still has 1/64 of the start, a third of a voxel at 128^3.)
-        start: radius at step 0 above the floor, share of the grid's edge.
+        start: radius at step 0 above the floor, fraction of the grid's edge.
         rounds: number of rounds.
         rate: halvings per round.
-        floor: radius at the end, share of the grid's edge.
+        floor: radius at the end, fraction of the grid's edge.
 
     Returns:
-        Radius as a share of the grid's edge. Source: SANeRF (Xiao et al. 2024).
+        Radius as a fraction of the grid's edge. Source: SANeRF (Xiao et al. 2024).
 
     Example:
         >>> annealed_radius(0, 300), annealed_radius(50, 300), annealed_radius(300, 300)
@@ -102,17 +102,17 @@ class _GridFilter(Regularizer):
 class FourierLowPass(_GridFilter):
     """The field sees the low frequencies of its grids, first few, at the end all: see `fourier_low_pass`.
 
-    The parameters stay as they are, and frequencies that are filtered out get no gradient. The share is of
+    The parameters stay as they are, and frequencies that are filtered out get no gradient. The fraction is of
     the present spectrum, whatever size the grid has been resampled to.
 
     Args:
         site: its `grids` are filtered, each along its spatial axes: lines, planes or voxels.
-        keep: share of the spectrum that stays, in [0, 1]. FourieRF: from 0.3 to 1 in 2,000 steps on
+        keep: fraction of the spectrum that stays, in [0, 1]. FourieRF: from 0.3 to 1 in 2,000 steps on
             synthetic scenes, from 0.01 in 10,000 on real ones.
         boundary: "periodic" (Fourier) or "mirror" (cosine).
 
     Formula: ``g_hat(k) * clamp(keep * K - k + 1, 0, 1)`` for the frequencies k = 0..K of each axis
-    Unit: share of the spectrum
+    Unit: fraction of the spectrum
     Source: FourieRF (Gomez et al. 2025)
 
     Raises:
@@ -128,19 +128,19 @@ class FourierLowPass(_GridFilter):
     boundary: Boundary = "periodic"
     open_at = 1.0
     ranges = within(keep=(0.0, 1.0))
+    example_arguments = (
+        {"keep": Linear(0.1, 1.0, until=0.5)},
+        {"keep": 0.4},
+        {"keep": 0.0, "boundary": "mirror"},
+    )
 
     def number(self, context: Context) -> float:
-        """Share of the spectrum."""
+        """Fraction of the spectrum."""
         return self.now("keep", context)
 
     def filtered(self, values: Tensor, axes: tuple[int, ...], number: float | Tensor) -> Tensor:
         """Values without their high frequencies."""
         return fourier_low_pass(values, axes, number, self.boundary)
-
-    @classmethod
-    def examples(cls, site: SiteLike) -> list[Regularizer]:
-        """Opening, fixed, and with mirrored borders."""
-        return [cls(site, Linear(0.1, 1.0, until=0.5)), cls(site, 0.4), cls(site, 0.0, boundary="mirror")]
 
 
 @register
@@ -149,18 +149,18 @@ class GridBlur(_GridFilter):
     """The field sees its grids blurred, less and less: see `annealed_radius` and `gaussian_blur`.
 
     SANeRF widens the footprint of its samples on mip-mapped planes; for a field without mip-maps a blur of
-    the grid does the same. The radius is a share of the grid's edge, so it survives resampling.
+    the grid does the same. The radius is a fraction of the grid's edge, so it survives resampling.
 
     Args:
         site: its `grids` are blurred, each along its spatial axes.
         until: fraction of the run (float) or step (int) from which the radius is `floor`.
-        start: first radius (standard deviation), share of the grid's edge; SANeRF: 0.15.
+        start: first radius (standard deviation), fraction of the grid's edge; SANeRF: 0.15.
         rounds: number of steps in which it shrinks; SANeRF: 30.
         rate: halvings per round; SANeRF: 0.2.
-        floor: radius that stays, share of the grid's edge.
+        floor: radius that stays, fraction of the grid's edge.
 
     Formula: Gaussian blur by ``floor + start / 2^(rate * int(rounds * t / T))``
-    Unit: share of the grid's edge
+    Unit: fraction of the grid's edge
     Source: SANeRF (Xiao et al. 2024)
 
     Raises:
@@ -174,9 +174,10 @@ class GridBlur(_GridFilter):
     rate: Numeric = 0.2
     floor: Numeric = 0.0
     ranges = dict.fromkeys(("until", "start", "rounds", "rate", "floor"), NOT_NEGATIVE)
+    example_arguments = ({"until": 0.5}, {"until": 3, "floor": 0.05})
 
     def number(self, context: Context) -> float:
-        """Radius, share of the grid's edge."""
+        """Radius, fraction of the grid's edge."""
         now = {name: self.now(name, context) for name in ("start", "rate", "floor")}
         rounds = int(self.now("rounds", context))
         return annealed_radius(context.step, context.end(self.until), rounds=rounds, **now)
@@ -184,8 +185,3 @@ class GridBlur(_GridFilter):
     def filtered(self, values: Tensor, axes: tuple[int, ...], number: float | Tensor) -> Tensor:
         """Blurred values."""
         return gaussian_blur(values, axes, number)
-
-    @classmethod
-    def examples(cls, site: SiteLike) -> list[Regularizer]:
-        """At its default, and with a blur that stays."""
-        return [cls(site, until=0.5), cls(site, until=3, floor=0.05)]

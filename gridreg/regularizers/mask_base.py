@@ -124,7 +124,7 @@ class Mask(Regularizer):
         return torch.where(mask != 0, value * mask, 0.0)
 
     def value(self, context: Context) -> float:
-        """Open share of the channels; 1 if there are none."""
+        """Open fraction of the channels; 1 if there are none."""
         mask = self.mask(context)
         return float(mask.mean()) if len(mask) else 1.0
 

@@ -102,7 +102,7 @@ def fixed_mask(channels: int, visible_ratio: float) -> Tensor:
 
     Args:
         channels: number of channels.
-        visible_ratio: share that stays open, in [0, 1]; the human-body runs of Few TensoRF use 0.8.
+        visible_ratio: fraction that stays open, in [0, 1]; the human-body runs of Few TensoRF use 0.8.
 
     Returns:
         Mask of shape `(channels,)`, float32.

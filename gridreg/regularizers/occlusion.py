@@ -7,7 +7,6 @@ from typing import Literal
 
 from torch import Tensor
 
-from gridreg.attach.sites import SiteLike
 from gridreg.base import NOT_NEGATIVE, Context, Regularizer, register
 from gridreg.errors import InputError
 from gridreg.samples import RaySamples
@@ -32,7 +31,7 @@ def occlusion_loss(
 
     The sum is divided by the number of all steps of all rays, as FreeNeRF's mean over a full rectangle of
     samples is; steps that the march skipped count as density 0. So the value does not depend on what was
-    skipped, and a ray that misses the box adds nothing. It does depend on the share of the ray that is
+    skipped, and a ray that misses the box adds nothing. It does depend on the fraction of the ray that is
     masked: with half the step length `count` covers half the distance, while `distance` means the same.
 
     Args:
@@ -108,6 +107,7 @@ class OcclusionLoss(Regularizer):
     colour_prior: Numeric | None = None
     near: Numeric | None = None
     ranges = dict.fromkeys(("samples", "distance", "colour_prior", "near"), NOT_NEGATIVE)
+    example_arguments = ({}, {"distance": 0.5, "on": "weights"}, {"samples": 3, "colour_prior": 5})
 
     def __post_init__(self) -> None:
         """Refuse at once what can be refused before the first step."""
@@ -123,8 +123,3 @@ class OcclusionLoss(Regularizer):
         """`occlusion_loss` with the numbers of this step."""
         now = {n: None if getattr(self, n) is None else self.now(n, context) for n in self.ranges}
         return occlusion_loss(samples, now.pop("samples"), on=self.on, **now)
-
-    @classmethod
-    def examples(cls, site: SiteLike) -> list[Regularizer]:
-        """By count, by distance, and with the prior."""
-        return [cls(), cls(distance=0.5, on="weights"), cls(samples=3, colour_prior=5)]

@@ -82,7 +82,7 @@ class WeightDecay(Regularizer):
 
     Args:
         site: its `grids` decay.
-        decay: share per unit of learning rate; ZeroRF: 0.2.
+        decay: fraction per unit of learning rate; ZeroRF: 0.2.
 
     Formula: ``p <- p - lr * decay * p``
     Unit: 1 / learning rate
@@ -96,6 +96,7 @@ class WeightDecay(Regularizer):
     decay: Numeric = 0.2
     shown = "decay"
     ranges = within(decay=NOT_NEGATIVE)
+    example_arguments = ({}, {"decay": 0.0})
 
     def parameter_groups(self, groups: Groups, grids: Sequence[Grid], context: Context) -> Groups:
         """Set the site's parameters apart, with their decay."""
@@ -109,11 +110,6 @@ class WeightDecay(Regularizer):
         """The decay of this step."""
         for group in _groups_of(groups, grids):
             group["weight_decay"] = self.value(context)
-
-    @classmethod
-    def examples(cls, site: SiteLike) -> list[Regularizer]:
-        """At its default, and off."""
-        return [cls(site), cls(site, decay=0.0)]
 
 
 @register
@@ -143,6 +139,7 @@ class LearningRate(Regularizer):
     scale: Numeric = 1.0
     shown = "scale"
     ranges = within(scale=(_LOWEST_SCALE, float("inf")))
+    example_arguments = ({}, {"scale": 0.5})
 
     def parameter_groups(self, groups: Groups, grids: Sequence[Grid], context: Context) -> Groups:
         """Set the site's parameters apart, with their learning rate."""
@@ -166,8 +163,3 @@ class LearningRate(Regularizer):
         for name in ("lr", "initial_lr"):
             if name in group and ratio != 1:
                 group[name] = group[name] * ratio
-
-    @classmethod
-    def examples(cls, site: SiteLike) -> list[Regularizer]:
-        """Off, and by a half."""
-        return [cls(site), cls(site, scale=0.5)]

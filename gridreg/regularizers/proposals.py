@@ -17,7 +17,7 @@ __all__ = ["ProposalLoss", "proposal_loss"]
 
 # As in nerfstudio's `interlevel_loss`; keeps the quotient finite where nothing was found.
 _TINY = 1e-7
-# Intervals that touch should not overlap by rounding: an end counts from this share of its length inwards.
+# Intervals that touch should not overlap by rounding: an end counts from this fraction of its length inwards.
 _TOUCH = 1e-3
 
 
@@ -71,7 +71,7 @@ def _allowed(samples: RaySamples, proposal: RaySamples) -> Tensor:
 
 
 def _ends(samples: RaySamples, share: float = 1.0) -> tuple[Tensor, Tensor]:
-    """Beginning and end of the middle share of each sample's interval, in float64."""
+    """Beginning and end of the middle fraction of each sample's interval, in float64."""
     t, half = samples.t.double(), samples.lengths.double() * (share / 2)
     return t - half, t + half
 

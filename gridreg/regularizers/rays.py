@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from gridreg.attach.sites import SiteLike
 from gridreg.base import Context, Regularizer, register, within
 from gridreg.errors import InputError
 from gridreg.regularizers.penalty_base import SamplesPenalty
@@ -26,7 +25,7 @@ __all__ = [
     "ray_entropy",
 ]
 
-# Keeps logarithms of shares finite; the value that InfoNeRF's program adds.
+# Keeps logarithms of fractions finite; the value that InfoNeRF's program adds.
 TINY = 1e-10
 
 
@@ -186,15 +185,11 @@ class RayEntropy(Regularizer):
     weight: Numeric = 1e-3
     threshold: Numeric = 0.1
     ranges = within(threshold=(0.0, 1.0))
+    example_arguments = ({}, {"threshold": 0.0})
 
     def penalty(self, samples: RaySamples, context: Context) -> Tensor:
         """`ray_entropy` with the threshold of this step."""
         return ray_entropy(samples, self.now("threshold", context))
-
-    @classmethod
-    def examples(cls, site: SiteLike) -> list[Regularizer]:
-        """At its default, and with every ray."""
-        return [cls(), cls(threshold=0.0)]
 
 
 @register
@@ -218,6 +213,7 @@ class DistortionLoss(Regularizer):
     weight: Numeric = 1e-3
     near: float | None = None
     far: float | None = None
+    example_arguments = ({}, {"near": 0.0, "far": 4.0})
 
     def __post_init__(self) -> None:
         """Refuse at once what can be refused before the first step."""
@@ -227,8 +223,3 @@ class DistortionLoss(Regularizer):
     def penalty(self, samples: RaySamples, context: Context) -> Tensor:
         """`distortion`."""
         return distortion(samples, self.near, self.far)
-
-    @classmethod
-    def examples(cls, site: SiteLike) -> list[Regularizer]:
-        """In world units, and in shares of an interval."""
-        return [cls(), cls(near=0.0, far=4.0)]

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from gridreg.attach.sites import SiteLike
 from gridreg.base import NOT_NEGATIVE, Context, Regularizer, register, within
 from gridreg.schedules import Numeric
 
@@ -24,8 +23,8 @@ def anneal_space(
     Args:
         near: ``(R,)`` distances, world units.
         far: ``(R,)`` distances, world units.
-        progress: share of the annealing that is over; from 1 on the interval is whole.
-        start: share of the interval at the beginning, in [0, 1].
+        progress: fraction of the annealing that is over; from 1 on the interval is whole.
+        start: fraction of the interval at the beginning, in [0, 1].
         middle: where in the interval the point lies, in [0, 1].
 
     Returns:
@@ -53,7 +52,7 @@ class SampleSpaceAnnealing(Regularizer):
     Args:
         until: fraction of the run (float) or step (int) from which the whole interval is sampled; RegNeRF:
             256 steps, 512 on some scenes.
-        start: share of the interval at the beginning, in [0, 1]; RegNeRF: 0.5.
+        start: fraction of the interval at the beginning, in [0, 1]; RegNeRF: 0.5.
         middle: where in the interval the middle lies, in [0, 1]; RegNeRF: 0.5.
 
     Formula: ``[m + (near - m) eta, m + (far - m) eta]``, ``eta = clamp(t / T, start, 1)``
@@ -65,6 +64,7 @@ class SampleSpaceAnnealing(Regularizer):
     start: Numeric = 0.5
     middle: Numeric = 0.5
     ranges = within(until=NOT_NEGATIVE, start=(0.0, 1.0), middle=(0.0, 1.0))
+    example_arguments = ({}, {"until": 0.5, "start": 0.1, "middle": 0.0})
 
     def near_far(self, near: Tensor, far: Tensor, context: Context) -> tuple[Tensor, Tensor]:
         """`anneal_space` at this step."""
@@ -77,11 +77,6 @@ class SampleSpaceAnnealing(Regularizer):
         )
 
     def value(self, context: Context) -> float:
-        """Share of the interval now."""
+        """Fraction of the interval now."""
         progress = context.step / context.end(self.until)
         return min(max(progress, self.now("start", context)), 1.0)
-
-    @classmethod
-    def examples(cls, site: SiteLike) -> list[Regularizer]:
-        """At its default, and about the near end."""
-        return [cls(), cls(until=0.5, start=0.1, middle=0.0)]

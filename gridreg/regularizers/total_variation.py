@@ -149,6 +149,13 @@ class TotalVariation(Regularizer):
     delta: float = 1.0
     share: float = 1.0
     ranges = within(delta=NOT_NEGATIVE, share=(0.0, 1.0))
+    example_arguments = (
+        {},
+        {"weight": Linear(0.0, 1.0)},
+        {"every": 3},
+        {"form": "huber", "delta": 0.1},
+        {"form": "absolute", "share": 0.5},
+    )
 
     def __post_init__(self) -> None:
         """Refuse at once what can be refused before the first step."""
@@ -187,12 +194,6 @@ class TotalVariation(Regularizer):
             for g in grids
         ]
 
-    @classmethod
-    def examples(cls, site: SiteLike) -> list[Regularizer]:
-        """With a number, with a schedule, not in every iteration, and in the other forms."""
-        forms = [cls(site, form="huber", delta=0.1), cls(site, form="absolute", share=0.5)]
-        return [cls(site), cls(site, weight=Linear(0.0, 1.0)), cls(site, every=3), *forms]
-
 
 @register
 @dataclass(frozen=True)
@@ -217,6 +218,7 @@ class TimeSmoothness(Regularizer):
     site: SiteLike
     weight: Numeric = 0.1
     axis: int = 0
+    example_arguments = ({}, {"axis": -1})
 
     def grid_penalty(self, grids: Sequence[Grid], context: Context) -> Tensor:
         """`time_smoothness`, added over the grids."""
@@ -227,8 +229,3 @@ class TimeSmoothness(Regularizer):
                     f"axis={self.axis}: {grid.name} has {len(grid.spatial)} spatial axes, from 0; which one is time?"
                 )
         return torch.stack([time_smoothness(g.values, g.spatial[self.axis]) for g in grids]).sum()
-
-    @classmethod
-    def examples(cls, site: SiteLike) -> list[Regularizer]:
-        """With time as the first axis, and as the last."""
-        return [cls(site), cls(site, axis=-1)]

@@ -149,7 +149,7 @@ def march_of(field: Any, settings: TrainSettings, near: float, far: float) -> Ma
         far=far,
         transmittance_bound=settings.transmittance_bound,
         weight_bound=settings.weight_bound,
-        merge_weight=settings.pool_weight,
+        merge_weight=settings.merge_weight,
     )
 
 

@@ -50,12 +50,12 @@ class TrainSettings:
         carve: start from the visual hull of the training views' alpha.
         step_ratio: ray step in cells.
         weight_bound: colour is evaluated where the weight exceeds this.
-        pool_weight: neighbours on a ray that weigh less than this share the colour of one of them, in training drawn by
-            weight (see `gridreg.ops.merging`); 0: every sample has its own.
-        faint_gradient: gradients of densities below this share of their mean size are rounded at random, to 0 or to the
-            share, so that their expectation stays; a field that does not offer it has all of them. 0: none.
+        merge_weight: low-weight samples, lighter than this, are merged with their neighbours on the ray and have the
+            colour of one of them, in training drawn by weight (see `gridreg.ops.merging`); 0: every sample has its own.
+        stochastic_rounding: gradients of densities below this fraction of their mean size are rounded at random, to 0
+            or to it, so that their expectation stays; a field that does not offer it has all of them. 0: none.
         transmittance_bound: samples behind this transmittance are dropped.
-        average_from: share of the run from which the mean of the iterates is kept (every fifth of them, none from
+        average_from: fraction of the run from which the mean of the iterates is kept (every fifth of them, none from
             before the last resampling); at the end of the run it takes the place of the last one. 1: the last stays.
         checkpoint_minutes: between checkpoints.
         evaluate_at: iterations at which the validation views (or, without them, some test views) are scored on the way.
@@ -85,8 +85,8 @@ class TrainSettings:
     carve: bool = False
     step_ratio: float = 0.5
     weight_bound: float = 1e-4
-    pool_weight: float = 0.0
-    faint_gradient: float = 0.0
+    merge_weight: float = 0.0
+    stochastic_rounding: float = 0.0
     transmittance_bound: float = 1e-4
     average_from: float = 1.0
     checkpoint_minutes: float = 2.0

@@ -72,7 +72,7 @@ class Trainer:
         self.optimizer = self._make_optimizer()
         make = getattr(field, "gradient_context", None)
         self._gradient_context: Callable[[], AbstractContextManager[Any]] = (
-            nullcontext if make is None else partial(make, rounding=settings.faint_gradient)
+            nullcontext if make is None else partial(make, rounding=settings.stochastic_rounding)
         )
 
     @property

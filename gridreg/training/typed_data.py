@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union
 
-from gridreg.errors import KeyPath
+from gridreg.errors import RENAMED_KEYS, KeyPath
 from gridreg.training.strict_yaml import Document
 
 __all__ = ["alternatives", "field_types", "from_data", "to_data"]
@@ -238,6 +238,8 @@ def _shown(value: Any) -> str:
 
 def _unknown(key: str, cls: type[Any]) -> str:
     valid = list(field_types(cls))
+    if RENAMED_KEYS.get(key) in valid:
+        return f"unknown key; it is called {RENAMED_KEYS[key]} now. valid: {', '.join(valid)}"
     names = _dotted_names(cls, "")
     near = difflib.get_close_matches(key, valid, n=3) + [n for n in names if n.endswith(f".{key}")]
     hint = f", did you mean {' or '.join(near)}?" if near else ";"

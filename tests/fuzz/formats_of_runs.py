@@ -55,7 +55,7 @@ train:
   resample_at: [10, 20]
   checkpoint_minutes: 5
   evaluate_at: [50]
-  pool_weight: 0.1
+  merge_weight: 0.1
 """
 STUDY = """title: A study
 name: small
