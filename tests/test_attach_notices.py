@@ -7,6 +7,7 @@ import gc
 import pickle
 import warnings
 from collections import OrderedDict
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import pytest
@@ -373,3 +374,28 @@ def test_a_grid_that_begins_with_zeros_is_no_loss() -> None:
         field.grid.zero_()
     with gridreg.apply(field, gridreg.FrequencyMask(GRID, until=1.0), total_steps=1000) as handle:
         steps(field, handle, 0, 20)
+
+
+@dataclass(frozen=True)
+class Misspelt(gridreg.Regularizer):
+    """Asks itself for what it does not have, in `transform`."""
+
+    site: Any
+
+    def transform(self, value: Tensor, context: gridreg.base.Context) -> Tensor:
+        return value * self.facter  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("buffer", [False, True])
+def test_a_missing_attribute_of_a_regularizer_is_no_missing_attribute_of_the_field(buffer: bool) -> None:
+    """Python asks `__getattr__` where a property raises AttributeError; torch's would give the raw tensor."""
+    field = nn.Module()
+    if buffer:
+        field.register_buffer("grid", torch.ones(1, 6, 4))
+    else:
+        field.grid = nn.Parameter(torch.ones(1, 6, 4))
+    handle = gridreg.apply(field, Misspelt(gridreg.parameters("grid", dim=1)), total_steps=10)
+    with pytest.raises(RuntimeError, match=r"grid: a regularizer on it raised .*facter"):
+        _ = field.grid
+    handle.remove()
+    assert bool((field.grid == 1).all())

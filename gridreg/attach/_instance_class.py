@@ -102,7 +102,12 @@ def _property(name: str) -> property:
             return value
         if not torch.compiler.is_compiling() and sys._getframe(1).f_code in _RAW_READERS:
             return value
-        return stack(value, self.training)
+        try:
+            return stack(value, self.training)
+        except AttributeError as error:
+            # Python would take it for a missing attribute and ask torch, which has the raw tensor: a regularizer with a
+            # slip of the pen would have no effect, without a word.
+            raise RuntimeError(f"{name}: a regularizer on it raised {error!r}") from error
 
     def put(self: nn.Module, value: Any) -> None:
         self.__dict__[name] = value
