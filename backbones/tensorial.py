@@ -186,6 +186,29 @@ class TensorialField(nn.Module):
         features = self.basis(self._components(u))
         return self.decoder(features, directions, 2 * u - 1, ray_indices)  # type: ignore[no-any-return]
 
+    def colour_of_means(
+        self, x: Tensor, directions: Tensor, ray_indices: Tensor, fractions: Tensor, offsets: Tensor
+    ) -> Tensor:
+        """Colours ``(P, 3)`` of the mean features of neighbours on a ray.
+
+        Args:
+            x: ``(N, 3)``; those of run p are ``offsets[p] : offsets[p + 1]``.
+            directions: ``(R, 3)``.
+            ray_indices: ``(P,)`` the ray of each run.
+            fractions: ``(N,)`` of each in the mean.
+            offsets: ``(P + 1,)`` int64.
+        """
+
+        def mean(values: Tensor) -> Tensor:
+            every = torch.arange(len(x), device=x.device)
+            options: dict[str, Any] = {"mode": "sum", "include_last_offset": True}
+            return F.embedding_bag(every, values, offsets, per_sample_weights=fractions, **options)
+
+        u = self.normalise(x)
+        # The basis is linear: it is the same before the mean, and then has more to do.
+        features = self.basis(mean(self._components(u).float()))
+        return self.decoder(features, directions, mean(2 * u - 1), ray_indices)  # type: ignore[no-any-return]
+
     def voxel_size(self) -> float:
         """Mean edge of a cell, world units."""
         nodes = torch.tensor(self.resolution, device=self.bounds.device)

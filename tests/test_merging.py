@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
+from backbones.vm import VMField
 from gridreg import ops
+from gridreg.ops import use_backend
 from gridreg.ops.merging import merge_neighbours
 from gridreg.rendering import MarchSettings, OccupancyGrid, Rays, render, render_rays
 
@@ -188,3 +191,82 @@ def test_without_gradients_colours_come_in_blocks(monkeypatch):
         assert torch.equal(image(field, 0.0, None), every)
     assert max(sizes) == 100
     assert len(sizes) > 2
+
+
+def averaged_field() -> VMField:
+    bounds = torch.tensor([[-1.0] * 3, [1.0] * 3])
+    return VMField(
+        bounds,
+        (12, 13, 14),
+        appearance_components=8,
+        scale=0.5,
+        density_shift=None,
+        initial_opacity=0.9,
+        generator=seeded(),
+        precision="float32",
+    )
+
+
+def averaged_image(field: nn.Module, feature_weight: float) -> Tensor:
+    march = MarchSettings(0.05, merge_weight=0.02, feature_weight=feature_weight)
+    grid = OccupancyGrid.full(field.bounds, (8, 8, 8))
+    return render_rays(field, rays_down(40), grid, march, background=torch.ones(3)).colour
+
+
+def test_means_of_a_linear_field_change_nothing():
+    """What is averaged before a linear decoder could be averaged behind it."""
+    field = averaged_field()
+    field.decoder = nn.Module()
+    field.decoder.forward = lambda features, directions, positions, ray_indices: (
+        features[:, :3] + positions + directions[ray_indices]
+    )
+    exact = averaged_image(field, 0.0)
+    for bound in (0.05, 0.3, 0.99):
+        torch.testing.assert_close(averaged_image(field, bound), exact, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("bound", [0.05, 0.3])
+def test_compiled_and_plain_means_agree(bound):
+    field, target = averaged_field(), torch.rand(40, 3, generator=seeded())
+    found = {}
+    for backend in ("auto", "torch"):
+        with use_backend(backend):
+            image = averaged_image(field, bound)
+            slopes = torch.autograd.grad((image - target).square().mean(), list(field.parameters()))
+        found[backend] = [image.detach(), *slopes]
+    assert float((found["auto"][0] - found["torch"][0]).abs().max()) < 1 / 255
+    for ours, plain in zip(found["auto"], found["torch"], strict=True):
+        torch.testing.assert_close(ours, plain, atol=2e-6, rtol=2e-3)
+
+
+def test_means_of_a_long_image_come_in_blocks(monkeypatch):
+    field = averaged_field()
+    with torch.no_grad():
+        every = averaged_image(field, 0.3)
+        monkeypatch.setattr(render, "_BLOCK", 50)
+        torch.testing.assert_close(averaged_image(field, 0.3), every, atol=1e-6, rtol=0)
+
+
+def test_fewer_colours_are_asked_for_with_means():
+    field, asked = averaged_field(), []
+    whole = field.decoder.forward
+    field.decoder.forward = lambda features, *others: (asked.append(len(features)), whole(features, *others))[
+        1
+    ]
+    averaged_image(field, 0.0)
+    averaged_image(field, 0.3)
+    assert 0 < asked[1] < asked[0] / 3
+
+
+def test_runs_weigh_less_than_twice_their_bound_and_never_hold_two_rays():
+    weights = torch.rand(200, generator=seeded()) * 0.1
+    offsets = torch.tensor([0, 60, 60, 150, 200])
+    _, rays, groups = ops.merge_samples(weights, offsets, 1e-4, 0.02)
+    means = ops.average_features(weights, groups, rays, 0.2)
+    inside = means.of_samples >= 0
+    totals = torch.zeros(len(means.offsets) - 1).index_add_(0, means.of_samples[inside], weights[inside])
+    assert float(totals.max()) < 0.4
+    assert int(means.offsets[-1]) == len(rays) == len(means.fractions)
+    for first, last in zip(means.offsets[:-1].tolist(), means.offsets[1:].tolist(), strict=True):
+        assert rays[first:last].unique().numel() == 1
+        assert float(means.fractions[first:last].sum()) == pytest.approx(1.0, abs=1e-5)

@@ -12,7 +12,7 @@ from gridreg.ops.cp import cp_density, cp_features, cp_march_density
 from gridreg.ops.dispatch import chosen_backend, use_backend
 from gridreg.ops.fused_adam import FusedAdam
 from gridreg.ops.gradient_buffers import accumulate_into_grad
-from gridreg.ops.merging import merge_samples, spread_to_samples
+from gridreg.ops.merging import FeatureMeans, average_features, merge_samples, spread_to_samples
 from gridreg.ops.perceptron import Block, Layer, encoded_mlp, mlp, product_dtype
 from gridreg.ops.ray_marching import Activation, MarchArguments, RayMarchResult, march, march_density
 from gridreg.ops.vm import vm_density, vm_features, vm_march_density
@@ -20,6 +20,7 @@ from gridreg.ops.vm import vm_density, vm_features, vm_march_density
 __all__ = [
     "Activation",
     "Block",
+    "FeatureMeans",
     "FusedAdam",
     "Layer",
     "MarchArguments",
@@ -37,6 +38,7 @@ __all__ = [
     "merge_samples",
     "mlp",
     "pixels",
+    "average_features",
     "product_dtype",
     "spread_to_samples",
     "terminate",

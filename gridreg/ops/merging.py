@@ -4,17 +4,30 @@ Consecutive samples are merged until they weigh a given amount, and one of them,
 proportion to its weight and lends its colour to the group. The expected colour of a ray, and the expected gradient of
 every colour, are those of evaluating them all; the gradient of a weight sees the colour of its group, in expectation
 the group's mean, in place of the sample's own.
+
+Where surfaces have formed, most of a ray's weight lies on a few neighbours that are alike. `average_features` joins
+groups whose features are averaged, so that the colour network is asked once for all of them.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from gridreg.ops.composite import check_packed, ray_of_sample
 from gridreg.ops.dispatch import operation
 
-__all__ = ["UNIT", "merge_neighbours", "merge_samples", "spread_to_samples"]
+__all__ = [
+    "UNIT",
+    "FeatureMeans",
+    "merge_neighbours",
+    "merge_samples",
+    "average_features",
+    "spread_to_samples",
+]
 
 # Of weights as integers: fine enough for any that counts, and eight million samples of weight 1 still add up.
 UNIT = 2.0**40
@@ -111,6 +124,43 @@ def merge_samples(
     groups = torch.full_like(weights, -1, dtype=torch.int64)
     groups[chosen] = merged
     return chosen[representatives], rays[representatives], groups
+
+
+class FeatureMeans(NamedTuple):
+    """Runs of neighbours on a ray whose features are averaged.
+
+    Args:
+        fractions: ``(G,)``, weight of each group of `merge_samples` in its run.
+        offsets: ``(P + 1,)`` int64; run p holds the groups ``offsets[p] : offsets[p + 1]``.
+        of_samples: ``(N,)`` int64, the run of each sample, -1 for none.
+    """
+
+    fractions: Tensor
+    offsets: Tensor
+    of_samples: Tensor
+
+
+@torch.no_grad()
+def average_features(weights: Tensor, groups: Tensor, rays: Tensor, bound: float) -> FeatureMeans:
+    """Join neighbouring groups until they weigh ``bound``; a run of several weighs less than twice that.
+
+    Args:
+        weights: ``(N,)``.
+        groups, rays: from `merge_samples`.
+        bound: weight, unitless; a group that weighs as much stays alone.
+
+    Example:
+        >>> groups, rays = torch.tensor([0, -1, 1, 2]), torch.tensor([0, 0, 0])
+        >>> found = average_features(torch.tensor([0.3, 0.0, 0.1, 0.5]), groups, rays, 0.5)
+        >>> [x.tolist() for x in (found.offsets, found.of_samples)]
+        [[0, 2, 3], [0, -1, 0, 1]]
+    """
+    # What samples in no group weigh is added up in front, and left out.
+    of_groups = weights.new_zeros(len(rays) + 1).index_add_(0, groups + 1, weights)[1:]
+    _, runs = merge_neighbours(of_groups, rays, bound)
+    offsets = F.pad(torch.bincount(runs).cumsum(0), (1, 0))
+    totals = weights.new_zeros(len(offsets) - 1).index_add_(0, runs, of_groups)
+    return FeatureMeans(of_groups / totals[runs], offsets, F.pad(runs, (1, 0), value=-1)[groups + 1])
 
 
 @operation()

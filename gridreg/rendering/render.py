@@ -30,8 +30,9 @@ class Field(Protocol):
 
     It may also offer ``march_density(rays, t_min, t_max, step, occupancy, jitter, transmittance_bound)``, which returns
     a `gridreg.ops.RayMarchResult` (or a plain tuple of its first five or more); ``colour_of_rays(x, directions,
-    ray_indices)``, which takes directions ``(R, 3)`` by ray; and ``colour_of_features(features, directions,
-    ray_indices)`` for the features that its march returned.
+    ray_indices)``, which takes directions ``(R, 3)`` by ray; ``colour_of_features(features, directions, ray_indices)``
+    for the features that its march returned; and ``colour_of_means(x, directions, ray_indices, fractions, offsets)``,
+    one colour for positions ``offsets[p] : offsets[p + 1]``, whose features it averages by their fractions.
     """
 
     bounds: Tensor
@@ -65,6 +66,8 @@ class MarchSettings:
         weight_bound: colour is evaluated only where the weight exceeds this (TensoRF uses 1e-4).
         merge_weight: low-weight samples, lighter than this, are merged with their neighbours on the ray and have the
             colour of one of them, see `gridreg.ops.merging`. 0: every sample has its own.
+        feature_weight: neighbours on the ray have one colour, that of their mean features, until they weigh this much;
+            for a field that offers ``colour_of_means``. 0: every one of them has its own.
     """
 
     step: float
@@ -73,6 +76,7 @@ class MarchSettings:
     transmittance_bound: float = 1e-4
     weight_bound: float = 1e-4
     merge_weight: float = 0.0
+    feature_weight: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -136,6 +140,45 @@ def _colours(
     return field.colour(positions, rays.directions[ray_indices])  # type: ignore[no-any-return]
 
 
+def _mean_colours(
+    field: Any,
+    marched: ops.RayMarchResult,
+    chosen: Tensor,
+    rays: Rays,
+    of_rays: Tensor,
+    means: ops.FeatureMeans,
+) -> Tensor:
+    """Colours of runs of samples, from their mean features; without gradients in blocks, as `_colours`."""
+    count = len(means.offsets) - 1
+    if not torch.is_grad_enabled() and len(chosen) > _BLOCK and count > 1:
+        middle = int(means.offsets[count // 2])
+        halves = (
+            (slice(0, middle), means.offsets[: count // 2 + 1]),
+            (slice(middle, None), means.offsets[count // 2 :] - middle),
+        )
+        return torch.cat(
+            [
+                _mean_colours(
+                    field,
+                    marched,
+                    chosen[half],
+                    rays,
+                    of_rays[half],
+                    means._replace(fractions=means.fractions[half], offsets=offsets),
+                )
+                for half, offsets in halves
+            ]
+        )
+    found: Tensor = field.colour_of_means(
+        marched.positions[chosen],
+        rays.directions,
+        of_rays[means.offsets[:-1]],
+        means.fractions,
+        means.offsets,
+    )
+    return found
+
+
 def render_rays(
     field: Any,
     rays: Rays,
@@ -178,7 +221,12 @@ def render_rays(
     coloured, of_rays, groups = ops.merge_samples(
         weights.detach(), marched.offsets, march.weight_bound, march.merge_weight, generator
     )
-    found = _colours(field, marched, coloured, rays, of_rays)
+    if march.feature_weight > 0 and marched.features is None and hasattr(field, "colour_of_means"):
+        means = ops.average_features(weights.detach(), groups, of_rays, march.feature_weight)
+        found = _mean_colours(field, marched, coloured, rays, of_rays, means)
+        coloured, groups = coloured[means.offsets[:-1]], means.of_samples
+    else:
+        found = _colours(field, marched, coloured, rays, of_rays)
     samples = RaySamples(
         offsets=marched.offsets,
         t=marched.t,

@@ -150,6 +150,7 @@ def march_of(field: Any, settings: TrainSettings, near: float, far: float) -> Ma
         transmittance_bound=settings.transmittance_bound,
         weight_bound=settings.weight_bound,
         merge_weight=settings.merge_weight,
+        feature_weight=settings.feature_weight,
     )
 
 

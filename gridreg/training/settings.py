@@ -52,6 +52,8 @@ class TrainSettings:
         weight_bound: colour is evaluated where the weight exceeds this.
         merge_weight: low-weight samples, lighter than this, are merged with their neighbours on the ray and have the
             colour of one of them, in training drawn by weight (see `gridreg.ops.merging`); 0: every sample has its own.
+        feature_weight: neighbours on a ray have one colour, that of their mean features, until they weigh this much, in
+            a field that offers it (see `gridreg.ops.average_features`); 0: every one has its own.
         stochastic_rounding: gradients of densities below this fraction of their mean size are rounded at random, to 0
             or to it, so that their expectation stays; a field that does not offer it has all of them. 0: none.
         transmittance_bound: samples behind this transmittance are dropped.
@@ -86,6 +88,7 @@ class TrainSettings:
     step_ratio: float = 0.5
     weight_bound: float = 1e-4
     merge_weight: float = 0.0
+    feature_weight: float = dataclasses.field(default=0.0, metadata={"unset": True})
     stochastic_rounding: float = 0.0
     transmittance_bound: float = 1e-4
     average_from: float = 1.0
@@ -104,7 +107,7 @@ class TrainSettings:
             value = getattr(self, name)
             if not (value > 0 and math.isfinite(value)):
                 raise ConfigError((name,), f"found {value}, expected a positive number")
-        for name in ("occupancy_threshold", "weight_bound", "transmittance_bound"):
+        for name in ("occupancy_threshold", "weight_bound", "transmittance_bound", "feature_weight"):
             value = getattr(self, name)
             if not 0 <= value < 1:
                 raise ConfigError((name,), f"found {value}, expected a number in [0, 1)")
