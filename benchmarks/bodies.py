@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 import stored
 import torch
+from mesh_image import mesh_image
 from stored import Record
-from surface import mesh_image
 
 from gridreg.cli import run_cli
 from gridreg.export import (

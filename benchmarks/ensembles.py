@@ -39,27 +39,37 @@ from gridreg.training.versions import versions
 STUDY, DEVIATIONS = "ensembles", "deviations"
 
 
-def score(folder: Path, run: str, arguments: argparse.Namespace) -> None:
-    """Join the first two kept runs, then three, and so on; score each on the protocol's test views, and store it.
+def name_of(folder: Path, run: str, seeds: Sequence[int], protocol: str) -> str:
+    """Return the name of a record."""
+    return f"{folder.name}-{protocol}-{run.replace(':', '+')}-seeds{','.join(map(str, seeds))}"
+
+
+def opened(
+    folder: Path, run: str, arguments: argparse.Namespace
+) -> tuple[Scene, list[LoadedRun], list[Record]]:
+    """Return a scene under the protocol, the kept runs of every seed, and their metrics.
 
     Raises:
         InputError: if a run is not kept, or was trained on other images.
     """
-    seeds, protocol, results = arguments.seeds, arguments.protocol, arguments.results
-    names = {
-        n: f"{folder.name}-{protocol}-{run.replace(':', '+')}-seeds{','.join(map(str, seeds[:n]))}"
-        for n in range(2, len(seeds) + 1)
-    }
+    places = [kept_run(arguments.kept, folder.name, run, s, arguments.protocol) for s in arguments.seeds]
+    scene, members = load_scene(folder, arguments.protocol), [load_run(place) for place in places]
+    for place, member in zip(places, members, strict=True):
+        if member.fingerprint != scene.fingerprint:
+            raise InputError(
+                f"{place}: trained on other images than those of {folder} under {scene.protocol}"
+            )
+    return scene, members, [json.loads((place / "metrics.json").read_text()) for place in places]
+
+
+def score(folder: Path, run: str, arguments: argparse.Namespace) -> None:
+    """Join the first two kept runs, then three, and so on; score each on the protocol's test views, and store it."""
+    seeds, results = arguments.seeds, arguments.results
+    names = {n: name_of(folder, run, seeds[:n], arguments.protocol) for n in range(2, len(seeds) + 1)}
     missing = {n: name for n, name in names.items() if not stored.find(STUDY, name, results)}
     if not missing:
         return
-    folders = [kept_run(arguments.kept, folder.name, run, seed, protocol) for seed in seeds]
-    scene = load_scene(folder, protocol)
-    members = [load_run(place) for place in folders]
-    for place, member in zip(folders, members, strict=True):
-        if member.fingerprint != scene.fingerprint:
-            raise InputError(f"{place}: trained on other images than those of {folder} under {protocol}")
-    alone = [json.loads((place / "metrics.json").read_text()) for place in folders]
+    scene, members, alone = opened(folder, run, arguments)
     for n, name in missing.items():
         record = joined_record(scene, run, seeds[:n], members[:n], alone[:n])
         stored.save(STUDY, name, record, results)
@@ -87,15 +97,8 @@ def joined_record(
         steps=joined.step,
         seconds={"test": time.perf_counter() - began, "train": sum(one["seconds"]["train"] for one in alone)},
         config={**to_data(joined.config), "scene": scene.name},
-        command=[
-            "benchmarks/ensembles.py",
-            "--scenes",
-            scene.name,
-            "--runs",
-            run,
-            "--seeds",
-            *map(str, seeds),
-        ],
+        command=f"benchmarks/ensembles.py --scenes {scene.name} --runs {run} --seeds".split()
+        + [str(seed) for seed in seeds],
         train_views=scene.train.names,
         run=run,
         members=[
@@ -131,22 +134,18 @@ def deviation_record(joined: LoadedRun, scene: Scene) -> Record:
 
 def store_deviation(folder: Path, run: str, arguments: argparse.Namespace) -> None:
     """Store whether the deviation of all seeds together tells where they are wrong."""
-    seeds, protocol = arguments.seeds, arguments.protocol
-    name = f"{folder.name}-{protocol}-{run.replace(':', '+')}-seeds{','.join(map(str, seeds))}"
+    seeds = arguments.seeds
+    name = name_of(folder, run, seeds, arguments.protocol)
     if stored.find(DEVIATIONS, name, arguments.results):
         return
-    scene = load_scene(folder, protocol)
-    places = [kept_run(arguments.kept, folder.name, run, seed, protocol) for seed in seeds]
-    joined = ensemble_of([load_run(place) for place in places])
-    if joined.fingerprint != scene.fingerprint:
-        raise InputError(f"{places[0]}: trained on other images than those of {folder} under {protocol}")
+    scene, members, _ = opened(folder, run, arguments)
     record = {
         "scene": scene.name,
         "builtin": scene.builtin,
-        "protocol": protocol,
+        "protocol": scene.protocol,
         "run": run,
         "seeds": list(seeds),
-        **deviation_record(joined, scene),
+        **deviation_record(ensemble_of(members), scene),
         "command": stored.command_line("benchmarks/ensembles.py"),
         "versions": versions(),
     }

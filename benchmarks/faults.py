@@ -35,7 +35,6 @@ import torch
 from timing.moments import Moments
 from timing.trial import (
     Trial,
-    differences,
     end_of_run,
     end_of_study,
     in_child,
@@ -122,13 +121,18 @@ def kills(trials: list[Trial], count: int, rng: random.Random, keep: Keep) -> di
             plan += [(place / len(numbers), trial, kind, number) for place, number in enumerate(numbers)]
     for _, trial, kind, number in sorted(plan, key=lambda one: one[0]):
         name = f"{trial.name}: {' '.join(trial.moments[number])}"
-        fault = trial.kill(number)
         record["kills"] += 1
         record["of"][f"{trial.name} {kind}"] = record["of"].get(f"{trial.name} {kind}", 0) + 1
-        record["faults"] += [f"{name}: {fault}"] if fault else []
-        print(f"{record['kills']}/{len(plan)} {name}: {fault or 'the same'}", flush=True)
+        record["faults"] += told(f"{record['kills']}/{len(plan)} {name}", trial.kill(number))
         keep(record)
     return record
+
+
+def told(name: str, fault: str) -> list[str]:
+    """Print what became of a trial, and return it if it is a fault."""
+    line = f"{name}: {fault or 'the same'}"
+    print(line, flush=True)
+    return [line] if fault else []
 
 
 def kilobytes_of(folder: Path) -> int:
@@ -143,7 +147,8 @@ def disks(trial: Trial) -> dict[str, Any]:
     # Within the first save, the second, and then in what is written after the training.
     sizes = [saved // 5, saved // 2, saved * 3 // 2, saved * 19 // 10]
     sizes += [saved + all_of_it * part // 10 for part in (2, 4, 6, 7, 8, 9)]
-    faults, kinds = [], Counter[str]()
+    faults: list[str] = []
+    kinds = Counter[str]()
     for kilobytes in sizes:
         disk = trial.folder / "disk"
         with small_disk(disk, 16_000) as kind:
@@ -170,17 +175,14 @@ def disks(trial: Trial) -> dict[str, Any]:
             if "Traceback" in text or status not in (0, 2) or (status == 2 and len(said) != 1):
                 fault = f"exit status {status}, said {text[-300:]!r}"
             filler.unlink(missing_ok=True)
-            again = trial.run(out)
-            places = differences(trial.whole, trial.end(out)) if again == 0 else [f"exit status {again}"]
-            fault = fault or ", ".join(places[:5])
-            print(f"disk with {kilobytes} KB left: {said or status}: {fault or 'the same'}", flush=True)
-            faults += [f"{kilobytes} KB: {fault}"] if fault else []
+            faults += told(f"{kilobytes} KB left: {said or status}", fault or trial.go_on(out))
     return {"disks": dict(kinds), "kilobytes_left": sizes, "faults": faults}
 
 
 def signals(trial: Trial) -> dict[str, Any]:
     """Send each signal at three iterations; the run saves, ends as it should, and goes on."""
-    faults, tried = [], 0
+    faults: list[str] = []
+    tried = 0
     places = [n for n, (_, name) in enumerate(trial.moments) if name == "iteration"]
     for name in ("SIGINT", "SIGTERM", "SIGHUP"):
         for moment in places[1 : len(places) - 1 : len(places) // 3]:
@@ -194,18 +196,14 @@ def signals(trial: Trial) -> dict[str, Any]:
 
             status = in_child(act, trial.log)
             fault = "" if status == 130 and has_checkpoint(out / "checkpoint") else f"exit status {status}"
-            again = trial.run(out)
-            changed = differences(trial.whole, trial.end(out)) if again == 0 else [f"exit status {again}"]
-            fault = fault or ", ".join(changed[:5])
             tried += 1
-            print(f"{name} at moment {moment}: {fault or 'the same'}", flush=True)
-            faults += [f"{name}: {fault}"] if fault else []
+            faults += told(f"{name} at moment {moment}", fault or trial.go_on(out))
     return {"signals": tried, "faults": faults}
 
 
 def writers(trial: Trial) -> dict[str, Any]:
     """Start two at a time into one folder: one is refused in a line, the other ends as if it were alone."""
-    whole, faults = trial.folder / "whole", []
+    whole, faults = trial.folder / "whole", list[str]()
     pairs: dict[str, Callable[[Path], list[str]]] = {
         "train": trial.words,
         "eval": lambda out: ["eval", str(whole), "--out", str(out)],
@@ -236,9 +234,8 @@ def writers(trial: Trial) -> dict[str, Any]:
         if status != 2 or "another run is writing here" not in text or ended != 0:
             fault = f"exit status {status} and {ended}, said {text[-200:]!r}"
         elif name == "train":
-            fault = ", ".join(differences(trial.whole, trial.end(out))[:5])
-        print(f"two of {name}: {fault or 'one is refused, the other the same'}", flush=True)
-        faults += [f"{name}: {fault}"] if fault else []
+            fault = trial.compare(out)
+        faults += told(f"two of {name}", fault)
     return {"pairs": sorted(pairs), "faults": faults}
 
 
@@ -276,11 +273,8 @@ def main() -> int:
             began = time.monotonic()
 
             def keep(record: dict[str, Any], part: str = part, began: float = began) -> None:
-                more = {
-                    "seed": options.seed,
-                    "seconds": round(time.monotonic() - began),
-                    "versions": versions(),
-                }
+                seconds = round(time.monotonic() - began)
+                more = {"seed": options.seed, "seconds": seconds, "versions": versions()}
                 name = part if not options.seed else f"{part}, seed {options.seed}"
                 stored.save("faults", name, record | more, options.results)
 

@@ -12,7 +12,6 @@ to benchmarks/results/load.jsonl.
 from __future__ import annotations
 
 import json
-import math
 import os
 import resource
 import subprocess
@@ -20,6 +19,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ import numpy as np
 import stored
 import torch
 from PIL import Image
+from scipy.spatial.transform import Rotation
 from timing.ball import ball_field
 
 from gridreg.ablation.report import write_report
@@ -40,15 +41,6 @@ from gridreg.rendering.model import Model
 from gridreg.scenes import load_scene
 from gridreg.training.rays import RayBank
 from gridreg.training.versions import versions
-
-BOUNDS = {
-    "images": (180.0, 1766.0),
-    "points": (60.0, 500.0),
-    "study": (300.0, 675.0),
-    "mesh": (45.0, 1500.0),
-    "viewer": (60.0, 300.0),
-}
-"""Seconds of the processor and MB of each."""
 
 
 def poses(count: int) -> list[np.ndarray]:
@@ -88,12 +80,7 @@ def make_points(folder: Path, count: int = 1_000_000, views: int = 40, size: int
     for k, pose in enumerate(poses(views)):
         Image.new("RGB", (size, size), (k, 99, 200)).save(folder / "images" / f"{k}.png")
         rotation = (pose[:3, :3] * [1, -1, -1]).T
-        w = math.sqrt(max(1e-12, 1 + np.trace(rotation))) / 2
-        x, y, z = (
-            (rotation[2, 1] - rotation[1, 2]) / (4 * w),
-            (rotation[0, 2] - rotation[2, 0]) / (4 * w),
-            (rotation[1, 0] - rotation[0, 1]) / (4 * w),
-        )
+        x, y, z, w = Rotation.from_matrix(rotation).as_quat()
         t = -rotation @ pose[:3, 3]
         lines.append(f"{k + 1} {w} {x} {y} {z} {t[0]} {t[1]} {t[2]} 1 {k}.png\n1.0 2.0 -1\n")
     (model / "images.txt").write_text("".join(lines))
@@ -147,14 +134,14 @@ def viewer(folder: Path) -> Any:
     return images
 
 
-MAKE: dict[str, Callable[[Path], None]] = {"images": make_images, "points": make_points, "study": make_study}
-TASKS: dict[str, Callable[[Path], Any]] = {
-    "images": images,
-    "points": points,
-    "study": study,
-    "mesh": mesh,
-    "viewer": viewer,
+TASKS: dict[str, tuple[Callable[[Path], None] | None, Callable[[Path], Any], float, float]] = {
+    "images": (make_images, images, 180.0, 1766.0),
+    "points": (make_points, points, 60.0, 500.0),
+    "study": (make_study, study, 300.0, 675.0),
+    "mesh": (None, mesh, 45.0, 1500.0),
+    "viewer": (None, viewer, 60.0, 300.0),
 }
+"""What makes the input of each, the task, and its bounds: seconds of the processor, and MB."""
 
 
 def apart(act: Callable[[], Any]) -> tuple[int, float, float]:
@@ -184,23 +171,23 @@ def main() -> int:
     torch.set_num_threads(1)
     missed = 0
     for name in options.tasks or TASKS:
-        with tempfile.TemporaryDirectory() as folder:
-            if name in MAKE and apart(lambda name=name, folder=folder: MAKE[name](Path(folder)))[0]:  # type: ignore[misc]
+        make, task, most_seconds, most_megabytes = TASKS[name]
+        with tempfile.TemporaryDirectory() as place:
+            if make is not None and apart(partial(make, Path(place)))[0]:
                 return 1
             began = time.perf_counter()
-            status, seconds, megabytes = apart(lambda name=name, folder=folder: TASKS[name](Path(folder)))  # type: ignore[misc]
+            status, seconds, megabytes = apart(partial(task, Path(place)))
             wall = time.perf_counter() - began
-            told = Path(folder) / "more.json"
+            told = Path(place) / "more.json"
             more = json.loads(told.read_text()) if told.is_file() else {}
-        most = BOUNDS[name]
-        kept = status == 0 and seconds <= most[0] and megabytes <= most[1]
+        kept = status == 0 and seconds <= most_seconds and megabytes <= most_megabytes
         missed += not kept
         record = {
             "seconds": round(seconds, 1),
             "wall_seconds": round(wall, 1),
             "megabytes": max(0, round(megabytes)),
         }
-        bound = {"most_seconds": most[0], "most_megabytes": most[1], "kept": kept}
+        bound = {"most_seconds": most_seconds, "most_megabytes": most_megabytes, "kept": kept}
         stored.save("load", name, record | more | bound | {"versions": versions()}, options.results)
         print(f"{name}: {json.dumps(record | more | bound)}", flush=True)
     return 1 if missed else 0

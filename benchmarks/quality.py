@@ -3,8 +3,7 @@
     python benchmarks/quality.py --data DIR --scenes lego chair --runs quick quick:tensorf quick:few_tensorf --seeds 0
 
 A run is PRESET or PRESET:COMPOSITION; with --opaque it sees nothing of the alpha, and is called RUN-opaque. Results
-that are stored already are not computed again. The table is printed from the stored ones: `python
-benchmarks/quality.py --table`.
+that are stored already are not computed again. `docs/make_results.py` makes tables of them.
 """
 
 from __future__ import annotations
@@ -18,7 +17,6 @@ from pathlib import Path
 
 import stored
 import torch
-from stored import Record
 from timing.whole_run import Spans
 
 from gridreg.cli import run_cli
@@ -27,22 +25,11 @@ from gridreg.scenes import Scene, Views
 from gridreg.training import StepReport, configure, execute, open_scene
 from gridreg.training.checkpoint import has_checkpoint
 from gridreg.training.options import TrainOptions
+from gridreg.training.record import summary
 
 STUDY = "quality"
 PROTOCOL = "dietnerf8"
 """The protocol where none is named."""
-HEAD = (
-    "scene",
-    "protocol",
-    "run",
-    "seed",
-    "steps",
-    "PSNR (dB)",
-    "SSIM 11x11",
-    "SSIM 7x7",
-    "training (s)",
-    "threads",
-)
 
 
 class Trained(Spans):
@@ -118,22 +105,12 @@ def score(folder: Path, run: str, seed: int, arguments: argparse.Namespace) -> N
     }
     metrics["config"] = {**metrics["config"], "scene": folder.name}
     stored.save(STUDY, name, metrics, arguments.results)
-    print(row(metrics), flush=True)
-
-
-def row(metrics: Record) -> str:
-    mean, seconds = metrics["mean"], metrics["seconds"]
-    return (
-        f"| {metrics['scene']} | {metrics['protocol']} | {' '.join([metrics['run'], *metrics.get('changes', [])])} "
-        f"| {metrics['seed']} | {metrics['steps']} "
-        f"| {mean['psnr']:.2f} | {mean['ssim_gaussian']:.4f} | {mean['ssim_uniform']:.4f} | {seconds['train']:.0f} "
-        f"| {metrics['versions']['threads']} |"
-    )
+    print(f"{name}: {summary(metrics)}; trained in {metrics['seconds']['train']:.0f} s", flush=True)
 
 
 def main(words: Sequence[str] | None = None) -> int:
     parser = stored.parser_of(__doc__, threads=True)
-    parser.add_argument("--data", type=Path, help="folder that holds the scenes")
+    parser.add_argument("--data", type=Path, required=True, help="folder that holds the scenes")
     parser.add_argument("--scenes", nargs="+", default=[])
     parser.add_argument("--runs", nargs="+", default=["quick"])
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
@@ -152,14 +129,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--opaque", action="store_true", help="without alpha: the images on the protocol's background"
     )
-    parser.add_argument("--table", action="store_true", help="print what is stored, and end")
     arguments = parser.parse_args(words)
-    if arguments.table:
-        print(f"| {' | '.join(HEAD)} |\n{'|---' * len(HEAD)}|")
-        print("\n".join(map(row, stored.load(STUDY, arguments.results))))
-        return 0
-    if arguments.data is None:
-        parser.error("--data: expected the folder that holds the scenes")
     if arguments.resume and arguments.keep is None:
         parser.error("--resume: expected the folder of the stopped runs with --keep")
     if arguments.threads:

@@ -6,8 +6,21 @@ import argparse
 import operator
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
+
+import jinja2
 
 from gridreg.training.files import write_text
+
+DOCS = Path(__file__).parent
+
+
+def rendered(page: str, **values: Any) -> str:
+    """Return a page from its template, such as ``results.md`` from ``results.md.jinja``; all it names must be there."""
+    environment = jinja2.Environment(
+        undefined=jinja2.StrictUndefined, keep_trailing_newline=True, trim_blocks=True
+    )
+    return environment.from_string((DOCS / f"{page}.jinja").read_text(encoding="utf-8")).render(values)
 
 
 def write_or_check(

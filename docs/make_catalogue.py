@@ -16,7 +16,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent))
 import yaml
-from generated import write_or_check
+from generated import rendered, write_or_check
 
 import gridreg
 from gridreg.base import REGISTRY, Regularizer, overrides
@@ -24,28 +24,10 @@ from gridreg.schedules import Schedule
 
 PAGE = Path(__file__).with_name("catalogue.md")
 
-KINDS = {
-    "F": "features: multiplies channels, or scales their gradients",
-    "P": "parameters: the field sees its grids filtered",
-    "L": "loss: a penalty on samples or grids, times `weight`",
-    "S": "sampling: which part of the rays is sampled",
-    "D": "data: what the rays are compared with",
-    "O": "optimizer: options of the site's parameter groups",
-}
-
+# Letters of the kinds, in the page's order; the page says what they mean.
+KINDS = "FPLSDO"
 FAMILIES = sorted((PAGE.parent / "families").glob("*.md"))
 FORMULAS: dict[str, str] = yaml.safe_load(PAGE.with_name("formulas.yaml").read_text(encoding="utf-8"))
-
-HEAD = """# Catalogue
-
-Every regularizer that `gridreg` registers, with its formula, defaults, unit and source. The name leads to its
-section, with images. Defaults are those of the class, in the order of its arguments; `site` has none. A number
-may be a schedule or a function of the step. Behind each class is a plain function, which its documentation
-names; `gridreg show regularizers NAME` prints that.
-
-Written by `python docs/make_catalogue.py` from the docstrings and `docs/formulas.yaml`; edit those.
-
-"""
 
 
 def kind_of(cls: type[Regularizer]) -> str:
@@ -121,11 +103,8 @@ def page() -> str:
     """The whole page."""
     package = f"{gridreg.__name__}."
     classes = [cls for cls in REGISTRY.values() if cls.__module__.startswith(package)]
-    classes.sort(key=lambda cls: (list(KINDS).index(kind_of(cls)), cls.__name__))
-    kinds = "\n".join(f"* **{letter}** {meaning}" for letter, meaning in KINDS.items())
-    titles = ("regularizer", "kind", "what it does", "defaults, unit, source")
-    head = f"| {' | '.join(titles)} |\n|{'---|' * len(titles)}\n"
-    return f"{HEAD}{kinds}\n\n{head}" + "\n".join(map(row_of, classes)) + "\n"
+    classes.sort(key=lambda cls: (KINDS.index(kind_of(cls)), cls.__name__))
+    return rendered("catalogue.md", rows=map(row_of, classes))
 
 
 def main(words: Sequence[str] | None = None) -> int:

@@ -14,7 +14,7 @@ from pathlib import Path
 import torch
 
 sys.path.insert(0, str(Path(__file__).parent))
-from drawing import comparison, filters, masks, penalties, sampling
+from drawing import contradictions, filters, masks, penalties, sampling
 from drawing.svg import drawn
 from generated import write_or_check
 
@@ -26,7 +26,7 @@ TOLERANCE = 0.25
 def diagrams() -> dict[str, str]:
     """Return all diagrams, SVG text by name."""
     torch.set_num_threads(1)
-    parts = [module.diagrams() for module in (masks, filters, penalties, sampling, comparison)]
+    parts = [module.diagrams() for module in (masks, filters, penalties, sampling, contradictions)]
     shown = {name: content for part in parts for name, content in part.items()}
     return {
         name: content if isinstance(content, str) else drawn(name, content) for name, content in shown.items()

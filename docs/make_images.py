@@ -24,7 +24,7 @@ from PIL import Image
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
-from surface import mesh_image
+from mesh_image import mesh_image
 
 from gridreg.cli.view import described
 from gridreg.export import Camera, Model, Viewer, read_mesh, video_path

@@ -12,27 +12,16 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-import jinja2
-
 sys.path.insert(0, str(Path(__file__).parent))
 import results_foreign
-from generated import write_or_check
-from results_tables import RESULTS, Results, load, psnr, table
+from generated import rendered, write_or_check
+from results_tables import RESULTS, ROWS, Results, load, table
 
-TEMPLATE = Path(__file__).with_name("results.md.jinja")
 PAGE, README = Path(__file__).with_name("results.md"), Path(__file__).parents[1] / "README.md"
 BEGIN, END = "<!-- results: begin -->", "<!-- results: end -->"
 FOREIGN = "<!-- foreign: begin -->", "<!-- foreign: end -->"
 PHOTOGRAPHS = Path(__file__).with_name("photographs.md")
 SHEET = "<!-- sheet: begin -->", "<!-- sheet: end -->"
-
-
-def page(results: Results) -> str:
-    """Return the whole page."""
-    environment = jinja2.Environment(undefined=jinja2.StrictUndefined, keep_trailing_newline=True)
-    return environment.from_string(TEMPLATE.read_text(encoding="utf-8")).render(
-        results=results, foreign=results_foreign
-    )
 
 
 def with_front(readme: str, front: str) -> str:
@@ -52,16 +41,9 @@ def between(page: str, text: str, first: str, last: str) -> str:
 def sheet(folder: Path = RESULTS) -> str:
     """Return what ``gridreg reconstruct`` makes of the built-in photographs, measured against the truth."""
     (one,) = [r for r in load("own_photographs", folder) if r["name"].startswith("sheet-8x")]
-    cameras, masks, mesh = one["camera_errors"], one["mask_overlap"], one["mesh"]
     rows = [
-        ("the one command, minutes", f"{one['seconds']['wall'] / 60:.1f}"),
-        ("cameras, largest error of direction, degrees", f"{cameras['rotation_degrees_max']:.3f}"),
-        ("cameras, largest error of place, % of the distance", f"{cameras['position_percent_max']:.3f}"),
-        ("masks, intersection over union, mean and worst", f"{masks['mean']:.3f}, {masks['least']:.3f}"),
-        ("mesh, Chamfer distance, % of the diagonal", f"{mesh['chamfer_percent']:.2f}"),
-        ("mesh, error of the height, %", f"{mesh['size_percent']:+.1f}"),
-        ("views that were not learned from, dB", f"{psnr(one['estimated']):.2f}"),
-        ("the same with true cameras and masks, dB", f"{psnr(one['true']):.2f}"),
+        (name, text.format(minutes=one["seconds"]["wall"] / 60, **one))
+        for name, text in ROWS["sheet"].items()
     ]
     return f"\n{table(('', 'measured'), rows)}\n"
 
@@ -74,7 +56,8 @@ def main(words: Sequence[str] | None = None) -> int:
         readme = with_front(README.read_text(encoding="utf-8"), results.front())
         photographs = between(PHOTOGRAPHS.read_text(encoding="utf-8"), sheet(), *SHEET)
         front = between(readme, results_foreign.sentence(), *FOREIGN)
-        return {PAGE: page(results), README: front, PHOTOGRAPHS: photographs}
+        page = rendered("results.md", results=results, foreign=results_foreign)
+        return {PAGE: page, README: front, PHOTOGRAPHS: photographs}
 
     return write_or_check(words, "make_results.py", texts)
 

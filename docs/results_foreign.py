@@ -7,24 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from results_tables import seeds_in_words, table, with_interval
+from results_tables import ROWS, seeds_in_words, table, with_interval
 from stored import RESULTS, Record, load
 
-NAMES = {
-    "tensorf": "nerfstudio's TensoRF",
-    "kplanes": "K-Planes",
-    "hash": "nerfacto's hash grid",
-    "mlp": "nerfstudio's NeRF",
-}
-PIECES = {
-    "background": "`ExpectedBackground` α",
-    "direction": "`ViewDependenceMask`, no bands",
-    "mask": "masks that open in half of the run",
-    "occlusion": "`OcclusionLoss`",
-    "distortion": "`DistortionLoss`",
-    "smooth": "`TotalVariation`",
-    "small": "`L2`",
-}
+NAMES, PIECES = ROWS["foreign"]["fields"], ROWS["foreign"]["pieces"]
 
 
 class Gain(NamedTuple):

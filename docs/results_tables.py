@@ -125,29 +125,27 @@ class Results:
                 pairs[scene, seed] = psnr(ours[seed]) - psnr(theirs[seed])
         return pairs
 
+    def cells(self, scene: str, protocol: str, run: str) -> list[str]:
+        """Return PSNR, the published figure, SSIM and minutes of a run."""
+        published = next((m.get("published", {}) for m in ROWS["methods"] if m["run"] == run), {}).get(scene)
+        seen = self.mean(scene, protocol, run, ssim)
+        return [
+            with_spread(self.mean(scene, protocol, run, psnr)),
+            "" if published is None else f"{published:.2f}",
+            "–" if seen is None else f"{seen.mean:.3f}",
+            time_taken(self.of(scene, protocol, run)),
+        ]
+
     def few_shot(self, protocol: str) -> str:
         """Return PSNR, SSIM and minutes of every method on every scene, published figures beside them."""
-        head = ["method"]
-        for scene in SCENES:
-            head += [f"{scene}: PSNR", "published", "SSIM 11x11", "training (min; threads)"]
         rows = []
         for method in ROWS["methods"]:
             found = [self.of(scene, protocol, method["run"]) for scene in SCENES]
-            if not any(found) and protocol != "dietnerf8":
-                continue
-            carved = any(record["uses_alpha"] for records in found for record in records.values())
-            cells = [method["name"] + (" α" if carved else "")]
-            for scene in SCENES:
-                published = method.get("published", {}).get(scene)
-                seen = self.mean(scene, protocol, method["run"], ssim)
-                cells += [
-                    with_spread(self.mean(scene, protocol, method["run"], psnr)),
-                    "" if published is None else f"{published:.2f}",
-                    "–" if seen is None else f"{seen.mean:.3f}",
-                    time_taken(self.of(scene, protocol, method["run"])),
-                ]
-            rows.append(cells)
-        return table(head, rows)
+            if any(found) or protocol == "dietnerf8":
+                carved = any(record["uses_alpha"] for records in found for record in records.values())
+                cells = [cell for scene in SCENES for cell in self.cells(scene, protocol, method["run"])]
+                rows.append([method["name"] + " α" * carved, *cells])
+        return table(["method", *heads("PSNR", "published", "SSIM 11x11", "training (min; threads)")], rows)
 
     def bodies(self) -> str:
         """Return PSNR on the human bodies."""
@@ -272,22 +270,16 @@ class Results:
 
     def front(self) -> str:
         """Return the table of README.md: a few runs under `dietnerf8`, published figures beside them."""
-        published = {method["run"]: method.get("published", {}) for method in ROWS["methods"]}
-        head = ["run"]
-        for scene in SCENES:
-            head += [f"{scene}: PSNR", "published", "minutes; threads"]
         rows = []
         for run in ROWS["front"]:
-            cells = [f"`{run}`"]
-            for scene in SCENES:
-                theirs = published[run].get(scene)
-                cells.append(with_spread(self.mean(scene, "dietnerf8", run, psnr)))
-                cells += [
-                    "" if theirs is None else f"{theirs:.2f}",
-                    time_taken(self.of(scene, "dietnerf8", run)),
-                ]
-            rows.append(cells)
-        return table(head, rows)
+            found = [self.cells(scene, "dietnerf8", run) for scene in SCENES]
+            rows.append([f"`{run}`", *(cell for cells in found for cell in (*cells[:2], cells[3]))])
+        return table(["run", *heads("PSNR", "published", "minutes; threads")], rows)
+
+
+def heads(first: str, *others: str) -> list[str]:
+    """Return heads of the columns of each scene, the first of which names it."""
+    return [head for scene in SCENES for head in (f"{scene}: {first}", *others)]
 
 
 def study_gains(records: Sequence[Record], label: str, sign: int = 1) -> dict[tuple[str, int], float]:

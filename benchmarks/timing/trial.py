@@ -28,7 +28,6 @@ from timing.moments import Moments
 
 __all__ = [
     "Trial",
-    "differences",
     "end_of_run",
     "end_of_study",
     "in_child",
@@ -188,10 +187,17 @@ class Trial:
         status = self.run(out, die_at=moment)
         if status != -signal.SIGKILL:
             return f"was not killed (exit status {status})"
-        damaged = what_stands(out)
+        return what_stands(out) or self.go_on(out)
+
+    def go_on(self, out: Path) -> str:
+        """Go on with a run, and return what is wrong with its end; nothing if it is the same."""
         status = self.run(out)
-        if damaged or status:
-            return damaged or f"did not go on (exit status {status}): {self.log.read_text()[-200:]}"
+        if status:
+            return f"did not go on (exit status {status}): {self.log.read_text()[-200:]}"
+        return self.compare(out)
+
+    def compare(self, out: Path) -> str:
+        """Return where the end of a run differs; nothing if it is the same."""
         places = differences(self.whole, self.end(out))
         return f"differs in {', '.join(places[:5])}" if places else ""
 

@@ -10,6 +10,7 @@ import contextlib
 import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.resources import files
 from pathlib import Path
 
 from gridreg.errors import InputError
@@ -22,47 +23,6 @@ SCHEMA_VERSION = 1
 APPLICATION_ID = 0x67726567
 """Marks the SQLite file as a store of ours ("greg")."""
 
-_SCHEMA = """
-CREATE TABLE runs (
-    hash TEXT PRIMARY KEY,
-    spec TEXT NOT NULL,
-    scene TEXT NOT NULL,
-    status TEXT NOT NULL CHECK (status IN ('waiting', 'running', 'done', 'failed')),
-    reason TEXT NOT NULL DEFAULT '',
-    metrics TEXT,
-    seconds REAL NOT NULL DEFAULT 0,
-    machine TEXT NOT NULL DEFAULT '',
-    fingerprint TEXT NOT NULL DEFAULT '',
-    worker TEXT,
-    token TEXT,
-    heartbeat REAL,
-    losses INTEGER NOT NULL DEFAULT 0
-);
-CREATE TABLE studies (
-    name TEXT PRIMARY KEY,
-    title TEXT NOT NULL,
-    baseline TEXT NOT NULL,
-    source TEXT NOT NULL,
-    modules TEXT NOT NULL
-);
-CREATE TABLE members (
-    study TEXT NOT NULL REFERENCES studies (name),
-    position INTEGER NOT NULL,
-    hash TEXT NOT NULL REFERENCES runs (hash),
-    label TEXT NOT NULL,
-    PRIMARY KEY (study, position)
-);
-CREATE TABLE attempts (
-    number INTEGER PRIMARY KEY AUTOINCREMENT,
-    hash TEXT NOT NULL REFERENCES runs (hash),
-    worker TEXT NOT NULL,
-    began REAL NOT NULL,
-    ended REAL,
-    outcome TEXT NOT NULL DEFAULT 'running'
-);
-CREATE INDEX members_by_hash ON members (hash);
-CREATE INDEX attempts_by_hash ON attempts (hash);
-"""
 _CORRUPT = (
     "the database is corrupt and was left as it is; move it away, and the same command takes the finished "
     "runs in runs/ over into a new one"
@@ -102,7 +62,9 @@ class Database:
             self._is_ours(connection)
         with self.writing() as connection:
             if not self._is_ours(connection):
-                for statement in _SCHEMA.split(";"):
+                for statement in (
+                    files("gridreg.ablation").joinpath("schema.sql").read_text("utf-8").split(";")
+                ):
                     connection.execute(statement)
                 connection.execute(f"PRAGMA application_id={APPLICATION_ID}")
                 connection.execute(f"PRAGMA user_version={SCHEMA_VERSION}")

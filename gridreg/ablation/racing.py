@@ -118,18 +118,10 @@ def race(plain: Plain, views: int, trial: Trial, affordable: Callable[[int], int
     alive, scores, done = list(rows), dict[tuple[str, int], float](), 0
 
     def gains() -> list[Gain]:
-        labels = dict.fromkeys(label for label, _ in scores if label != START)
-        return [
-            Gain(
-                label,
-                tuple(
-                    scores[label, view] - scores[START, view]
-                    for view in range(done)
-                    if (label, view) in scores
-                ),
-            )
-            for label in labels
-        ]
+        found: dict[str, list[float]] = {}
+        for (label, view), psnr in scores.items():
+            found.setdefault(label, []).append(psnr - scores[START, view])
+        return [Gain(label, tuple(values)) for label, values in found.items() if label != START]
 
     while done < views:
         # As many trials again as views are done are kept for all winners at once.

@@ -32,7 +32,6 @@ from gridreg.ablation.edits import (
     parts_of,
     removed,
     replaced,
-    title_of,
 )
 from gridreg.compositions.named import composition as named_composition
 from gridreg.compositions.plain_data import to_config
@@ -40,7 +39,7 @@ from gridreg.errors import ConfigError
 from gridreg.training.strict_yaml import Document
 from gridreg.training.typed_data import from_data
 
-__all__ = ["KEYS", "Row", "expand_rows"]
+__all__ = ["KEYS", "StudyRow", "expand_rows"]
 
 KEYS: dict[str, tuple[str, ...]] = {
     "name": ("remove", "replace", "add"),
@@ -58,7 +57,7 @@ _MOST_PARTS = 12
 
 
 @dataclass(frozen=True)
-class Row:
+class StudyRow:
     """One row of a study before it meets presets, scenes and seeds.
 
     Args:
@@ -92,7 +91,7 @@ class Row:
         return _edited(held, self.edits)
 
 
-def expand_rows(entry: Any) -> list[Row]:
+def expand_rows(entry: Any) -> list[StudyRow]:
     """The rows of one entry.
 
     Raises:
@@ -173,19 +172,19 @@ def _read(entry: Any) -> _Entry:
     return read
 
 
-def _named(entry: _Entry) -> list[Row]:
+def _named(entry: _Entry) -> list[StudyRow]:
     name, edits = str(entry.name), {k: getattr(entry, k) for k in _EDITS if getattr(entry, k) is not None}
     plain = None if name == "preset" else _edited(known_composition(name), edits)
-    return [Row(entry.label or name.rpartition(":")[2] + _edit_titles(edits), plain, edits)]
+    return [StudyRow(entry.label or name.rpartition(":")[2] + _edit_titles(edits), plain, edits)]
 
 
-def _written(entry: _Entry) -> list[Row]:
+def _written(entry: _Entry) -> list[StudyRow]:
     if entry.label is None:
         raise ConfigError(("label",), "missing; a composition written out needs a name for the tables")
-    return [Row(entry.label, normalised(entry.regularizers))]
+    return [StudyRow(entry.label, normalised(entry.regularizers))]
 
 
-def _base(entry: _Entry, key: str, label: str | None) -> tuple[Row, Plain]:
+def _base(entry: _Entry, key: str, label: str | None) -> tuple[StudyRow, Plain]:
     """The row that a generator starts from, and its composition."""
     value = getattr(entry, key)
     with Document(value, "").locating(key):
@@ -205,20 +204,20 @@ def _parts(entry: _Entry, plain: Plain) -> dict[str, Plain]:
     return parts_of(plain, entry.parts, entry.by or "name")
 
 
-def _leave_one_out(entry: _Entry) -> list[Row]:
+def _leave_one_out(entry: _Entry) -> list[StudyRow]:
     base, plain = _base(entry, "leave_one_out", entry.label)
     parts = _parts(entry, plain).items()
     return [base, *(replace(base, label=f"{base.label} - {n}", plain=_without(plain, p)) for n, p in parts)]
 
 
-def _one_at_a_time(entry: _Entry) -> list[Row]:
+def _one_at_a_time(entry: _Entry) -> list[StudyRow]:
     _, whole = _base(entry, "one_at_a_time", None)
     on, plain = _base(entry, "on", entry.label)
     parts = _parts(entry, whole).items()
     return [on, *(replace(on, label=f"{on.label} + {n}", plain=[*plain, *part]) for n, part in parts)]
 
 
-def _product(entry: _Entry) -> list[Row]:
+def _product(entry: _Entry) -> list[StudyRow]:
     base, plain = _base(entry, "product", entry.label)
     parts = _parts(entry, plain)
     if len(parts) > _MOST_PARTS:
@@ -231,7 +230,7 @@ def _product(entry: _Entry) -> list[Row]:
     return rows
 
 
-def _sweep(entry: _Entry) -> list[Row]:
+def _sweep(entry: _Entry) -> list[StudyRow]:
     base, plain = _base(entry, "sweep", entry.label)
     values, key, argument = entry.values, entry.key, entry.argument
     if not values:
@@ -281,5 +280,4 @@ def _edit_titles(edits: Mapping[str, Any]) -> str:
 
 
 def _without(plain: Plain, part: Plain) -> Plain:
-    titles = [title_of(regularizer) for regularizer in part]
-    return [r for r in plain if not (title_of(r) in titles and r in part)]
+    return [regularizer for regularizer in plain if regularizer not in part]

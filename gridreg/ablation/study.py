@@ -25,13 +25,14 @@ import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 
 import gridreg
 from gridreg.ablation.own_command import words_of
 from gridreg.ablation.records import RunSpec, Study
-from gridreg.ablation.rows import Row, expand_rows
+from gridreg.ablation.rows import StudyRow, expand_rows
 from gridreg.ablation.study_file import StudyFile
 from gridreg.errors import ConfigError
 from gridreg.fields import field_names, import_modules, make_field
@@ -44,7 +45,7 @@ from gridreg.training.run import regularizers_of
 from gridreg.training.settings import RunConfig
 from gridreg.training.strict_yaml import parse_yaml
 
-__all__ = ["BUILTIN_FRAMES", "DATA_VARIABLE", "check_fits", "load_study", "study_from_text"]
+__all__ = ["BUILTIN_FRAMES", "DATA_VARIABLE", "check_fits", "load_study", "run_of", "study_from_text"]
 
 DATA_VARIABLE = "GRIDREG_DATA"
 BUILTIN_FRAMES = 18
@@ -87,7 +88,7 @@ def study_from_text(
     file = from_data(StudyFile, document)
     import_modules(file.modules, source, beside=folder)
 
-    rows: list[Row] = []
+    rows: list[StudyRow] = []
     for index, entry in enumerate(file.compositions):
         with document.locating("compositions", index):
             rows += expand_rows(entry)
@@ -102,7 +103,7 @@ def study_from_text(
     return Study(study_name, file.title or study_name, baseline, runs, text, tuple(file.modules))
 
 
-def _runs(file: StudyFile, rows: Sequence[Row], scenes: Sequence[Path | None]) -> list[RunSpec]:
+def _runs(file: StudyFile, rows: Sequence[StudyRow], scenes: Sequence[Path | None]) -> list[RunSpec]:
     """Every run, row by row."""
     if len(rows) * len(scenes) * len(file.seeds) > _MOST_RUNS:
         raise ConfigError(
@@ -136,30 +137,42 @@ def _runs(file: StudyFile, rows: Sequence[Row], scenes: Sequence[Path | None]) -
 
 
 def _row_runs(file: StudyFile, label: str, config: RunConfig, scenes: Sequence[Path | None]) -> list[RunSpec]:
-    runs = []
-    for scene in scenes:
-        for protocol in _protocols(file, scene):
-            for seed in file.seeds:
-                path = None if scene is None else str(scene)
-                full = dataclasses.replace(
-                    config, scene=path, protocol=protocol.name, seed=seed, modules=tuple(file.modules)
-                )
-                runs.append(
-                    RunSpec(
-                        label=label,
-                        scene=path,
-                        protocol=protocol.name,
-                        views=_view_count(protocol),
-                        seed=seed,
-                        preset=config.preset,
-                        backbone=config.backbone,
-                        config=to_data(full),
-                        size=file.size,
-                        test=None if file.test is None else tuple(file.test),
-                        command=() if file.command is None else words_of(file.command),
-                    )
-                )
-    return runs
+    test = None if file.test is None else tuple(file.test)
+    command = () if file.command is None else words_of(file.command)
+    return [
+        run_of(
+            label,
+            dataclasses.replace(
+                config,
+                scene=None if scene is None else str(scene),
+                protocol=protocol.name,
+                seed=seed,
+                modules=tuple(file.modules),
+            ),
+            views=_view_count(protocol),
+            size=file.size,
+            test=test,
+            command=command,
+        )
+        for scene in scenes
+        for protocol in _protocols(file, scene)
+        for seed in file.seeds
+    ]
+
+
+def run_of(label: str, config: RunConfig, *, views: int = 0, **others: Any) -> RunSpec:
+    """The run of a configuration with scene and protocol; ``others`` as in `RunSpec`."""
+    return RunSpec(
+        label,
+        config.scene,
+        str(config.protocol),
+        views,
+        config.seed,
+        config.preset,
+        config.backbone,
+        to_data(config),
+        **others,
+    )
 
 
 def check_fits(label: str, config: RunConfig) -> None:
@@ -184,7 +197,7 @@ def _backbone_of(preset: str, key: str) -> str:
         raise ConfigError((key,), error.problem) from None
 
 
-def _config(file: StudyFile, row: Row, preset: str, backbone: str) -> RunConfig:
+def _config(file: StudyFile, row: StudyRow, preset: str, backbone: str) -> RunConfig:
     """Preset, then field, composition, the study's values, the row's values, and the number of steps."""
     if backbone not in field_names():
         key = "compositions" if row.backbone else "backbones"

@@ -22,15 +22,15 @@ from gridreg.ablation.comparison import figure_of
 from gridreg.ablation.edits import Plain
 from gridreg.ablation.progress import StudyProgress
 from gridreg.ablation.racing import FEWEST, race, table
-from gridreg.ablation.records import RunSpec, Study
+from gridreg.ablation.records import Study
 from gridreg.ablation.store import Store
-from gridreg.ablation.study import check_fits
+from gridreg.ablation.study import check_fits, run_of
 from gridreg.compositions.plain_data import to_config
 from gridreg.errors import ConfigError, InputError
 from gridreg.machine import usable_cores
 from gridreg.scenes import builtin_scene, default_protocol
 from gridreg.scenes.load import training_views
-from gridreg.training.config import save_yaml, to_data
+from gridreg.training.config import save_yaml
 from gridreg.training.options import TrainOptions, configure
 from gridreg.training.run import regularizers_of
 from gridreg.training.settings import RunConfig
@@ -168,19 +168,7 @@ def _study(config: RunConfig, rows: Mapping[str, Plain], views: Sequence[int]) -
             own = dataclasses.replace(config, protocol=protocol, composition=plain)
             with contextlib.suppress(ConfigError):
                 check_fits(label, own)
-                runs.append(
-                    RunSpec(
-                        label=label,
-                        scene=config.scene,
-                        protocol=protocol,
-                        views=0,
-                        seed=config.seed,
-                        preset=config.preset,
-                        backbone=config.backbone,
-                        config=to_data(own),
-                        size=config.size,
-                    )
-                )
+                runs.append(run_of(label, own, size=config.size))
     name = f"tune-{views[0]}" if len(rows) > 1 else "tune-together"
     title = f"{len(rows)} variations with views {', '.join(map(str, views))} left out"
     return Study(name, title, next(iter(rows)), tuple(runs), "")

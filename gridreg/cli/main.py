@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Union
 
@@ -24,52 +24,51 @@ class Command:
 
     Args:
         about: one line for the overview.
-        options: ``module:class`` of its options.
-        run: ``module:function`` that takes them and returns the exit status.
+        options: name of the dataclass of its options.
+        module: that holds this dataclass, and ``run``, which takes the options and returns the exit status.
     """
 
     about: str
     options: str
-    run: str
+    module: str
+
+    def load(self) -> tuple[Any, Callable[[Any], int | None]]:
+        """Import it: the dataclass of its options, and what runs it."""
+        module = importlib.import_module(self.module)
+        return getattr(module, self.options), module.run
 
 
-def _own(about: str, module: str, options: str) -> Command:
-    return Command(about, f"gridreg.cli.{module}:{options}", f"gridreg.cli.{module}:run")
+def _own(about: str, options: str, module: str) -> Command:
+    return Command(about, options, f"gridreg.cli.{module}")
 
 
 COMMANDS: dict[str, Command] = {
-    "board": _own("draw the sheet to print and to photograph an object on", "board", "BoardOptions"),
-    "reconstruct": _own("make an object of photographs, in one command", "reconstruct", "ReconstructOptions"),
-    "prepare": _own("turn a folder of images into a scene", "prepare", "PrepareOptions"),
-    "train": Command(
-        "reconstruct a scene, score it, and write a mesh and a video",
-        "gridreg.training.options:TrainOptions",
-        "gridreg.cli.train:run",
-    ),
-    "eval": _own("score a checkpoint again", "evaluate", "EvalOptions"),
-    "ensemble": _own("make one run of several: the mean of their fields", "ensemble", "EnsembleOptions"),
-    "view": _own("look at a checkpoint in the browser", "view", "ViewOptions"),
-    "render": _own("render a video of one checkpoint, or of several side by side", "render", "RenderOptions"),
-    "mesh": _own("cut a mesh out of a checkpoint", "mesh", "MeshOptions"),
-    "page": _own("make the page of a run, to pass on", "page", "PageOptions"),
-    "compare-mesh": _own("measure a mesh against the true one", "compare_mesh", "CompareMeshOptions"),
+    "board": _own("draw the sheet to print and to photograph an object on", "BoardOptions", "board"),
+    "reconstruct": _own("make an object of photographs, in one command", "ReconstructOptions", "reconstruct"),
+    "prepare": _own("turn a folder of images into a scene", "PrepareOptions", "prepare"),
+    "train": _own("reconstruct a scene, score it, and write a mesh and a video", "TrainOptions", "train"),
+    "eval": _own("score a checkpoint again", "EvalOptions", "evaluate"),
+    "ensemble": _own("make one run of several: the mean of their fields", "EnsembleOptions", "ensemble"),
+    "view": _own("look at a checkpoint in the browser", "ViewOptions", "view"),
+    "render": _own("render a video of one checkpoint, or of several side by side", "RenderOptions", "render"),
+    "mesh": _own("cut a mesh out of a checkpoint", "MeshOptions", "mesh"),
+    "page": _own("make the page of a run, to pass on", "PageOptions", "page"),
+    "compare-mesh": _own("measure a mesh against the true one", "CompareMeshOptions", "compare_mesh"),
     "ablate": Command(
         "compare compositions of regularizers over scenes and seeds",
-        "gridreg.ablation.command:AblationOptions",
-        "gridreg.ablation.command:run",
+        "AblationOptions",
+        "gridreg.ablation.command",
     ),
     "tune": Command(
         "choose strengths of regularizers by the training views of a scene",
-        "gridreg.ablation.tune:TuneOptions",
-        "gridreg.ablation.tune:run",
+        "TuneOptions",
+        "gridreg.ablation.tune",
     ),
     "report": Command(
-        "make the report of a table of anybody's results",
-        "gridreg.ablation.table_report:ReportOptions",
-        "gridreg.ablation.table_report:run",
+        "make the report of a table of anybody's results", "ReportOptions", "gridreg.ablation.table_report"
     ),
-    "show": _own("list presets, compositions, protocols, regularizers and keys", "show", "ShowOptions"),
-    "bench": _own("run a benchmark of a checkout", "bench", "BenchOptions"),
+    "show": _own("list presets, compositions, protocols, regularizers and keys", "ShowOptions", "show"),
+    "bench": _own("run a benchmark of a checkout", "BenchOptions", "bench"),
 }
 """The commands by name, in the order of the overview."""
 
@@ -99,21 +98,21 @@ def _main(words: list[str]) -> int:
     if name not in COMMANDS:
         known = ", ".join(COMMANDS)
         raise InputError(f"command: found {name!r}, expected one of {known}{near_names(name, COMMANDS)}")
-    run = _load(COMMANDS[name].run)
+    options, run = COMMANDS[name].load()
     if name == "bench":
         # What follows the name of a benchmark is the benchmark's own.
-        return int(run(rest))
+        return int(run(rest) or 0)
     from gridreg.cli.arguments import parse_options
     from gridreg.training.progress import compilation_shown
 
-    options = parse_options(options_of(name), rest, f"gridreg {name}")
+    chosen = parse_options(options, rest, f"gridreg {name}")
     with compilation_shown():
-        return int(run(options) or 0)
+        return int(run(chosen) or 0)
 
 
 def options_of(name: str) -> Any:
     """The dataclass of a command's options."""
-    return _load(COMMANDS[name].options)
+    return COMMANDS[name].load()[0]
 
 
 def overview() -> str:
@@ -140,11 +139,6 @@ def overview() -> str:
             "  gridreg view RUN",
         ]
     )
-
-
-def _load(place: str) -> Any:
-    module, _, name = place.partition(":")
-    return getattr(importlib.import_module(module), name)
 
 
 def _completion(words: list[str]) -> int:

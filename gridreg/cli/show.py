@@ -6,6 +6,7 @@ import inspect
 import json
 import re
 import textwrap
+from collections.abc import Callable
 from dataclasses import dataclass, fields, is_dataclass
 from typing import Annotated, Any, Literal
 
@@ -39,12 +40,13 @@ def run(options: ShowOptions) -> int:
     Raises:
         InputError: for a name that is none of the kind.
     """
-    known = _KINDS[options.kind]()
+    all_of, one = _KINDS[options.kind]
+    known = all_of()
     if options.name is None:
         width = max(map(len, known))
         print("\n".join(f"{name:<{width}}  {about}".rstrip() for name, about in known.items()))
         return 0
-    shown = _DETAILS[options.kind](options.name) if options.name in known else _beyond(options)
+    shown = one(options.name) if options.name in known else _beyond(options)
     if shown is None:
         near = near_names(options.name, known)
         raise InputError(f"{options.kind}: found {options.name!r}, expected one of {', '.join(known)}{near}")
@@ -164,17 +166,11 @@ def _sentence(text: str) -> str:
     return textwrap.shorten(re.sub(r": see `.*$", "", found[0] if found else first).rstrip("."), 110)
 
 
-_KINDS = {
-    "presets": _presets,
-    "compositions": _compositions,
-    "protocols": _protocols,
-    "regularizers": _regularizers,
-    "config": _config,
-}
-_DETAILS = {
-    "presets": _preset,
-    "compositions": _composition,
-    "protocols": _protocol,
-    "regularizers": _regularizer,
-    "config": _key,
+# For each kind, what lists all of it with a line about each, and what shows one.
+_KINDS: dict[str, tuple[Callable[[], dict[str, str]], Callable[[str], str]]] = {
+    "presets": (_presets, _preset),
+    "compositions": (_compositions, _composition),
+    "protocols": (_protocols, _protocol),
+    "regularizers": (_regularizers, _regularizer),
+    "config": (_config, _key),
 }

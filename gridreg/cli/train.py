@@ -23,7 +23,7 @@ from gridreg.training import (
 from gridreg.training.record import summary
 from gridreg.training.tensorboard import TensorBoard
 
-__all__ = ["run"]
+__all__ = ["TrainOptions", "run"]
 
 
 def run(
