@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar
 import torch
 from torch import Tensor
 
-from gridreg.attach._arguments import NOT_NEGATIVE, check_site, choices_of, within
-from gridreg.attach.sites import Grid, Place, SiteLike
+from gridreg.attach.sites import NOT_NEGATIVE, Grid, Place, SiteLike, check_site, choices_of, within
 from gridreg.errors import InputError
 from gridreg.schedules import Numeric, check_numeric, end_step, resolve
 

@@ -35,6 +35,7 @@ class _SumPerRay(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, values: Tensor, offsets: Tensor, ray_indices: Tensor) -> Tensor:
+        """``(N, ...)`` to ``(R, ...)``."""
         ctx.save_for_backward(offsets, ray_indices)
         if values.shape[0] == 0:
             return values.new_zeros((offsets.shape[0] - 1, *values.shape[1:]))
@@ -42,6 +43,7 @@ class _SumPerRay(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:
+        """``(R, ...)`` to ``(N, ...)``."""
         return spread(gradients[0], *ctx.saved_tensors), None, None
 
 
@@ -50,11 +52,13 @@ class _Spread(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, values: Tensor, offsets: Tensor, ray_indices: Tensor) -> Tensor:
+        """``(R, ...)`` to ``(N, ...)``."""
         ctx.save_for_backward(offsets, ray_indices)
         return values.index_select(0, ray_indices)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:
+        """``(N, ...)`` to ``(R, ...)``."""
         return sum_per_ray(gradients[0], *ctx.saved_tensors), None, None
 
 
@@ -63,12 +67,14 @@ class _SumBefore(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, values: Tensor, offsets: Tensor, ray_indices: Tensor) -> Tensor:
+        """``(N,)`` to ``(N,)``."""
         ctx.save_for_backward(offsets, ray_indices)
         running, ends = _running(values, offsets)
         return (running[:-1] - ends[:-1].index_select(0, ray_indices)).to(values.dtype)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:
+        """The sum over the later samples of the same ray."""
         gradient = gradients[0]
         total = spread(sum_per_ray(gradient, *ctx.saved_tensors), *ctx.saved_tensors)
         return total - gradient - sum_before(gradient, *ctx.saved_tensors), None, None

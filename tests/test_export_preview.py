@@ -12,8 +12,8 @@ from torch import nn
 import gridreg
 from gridreg.errors import InputError
 from gridreg.export.cameras import look_at
-from gridreg.export.pace import Pace
 from gridreg.export.preview import Preview
+from gridreg.export.viewer_screen import Pace
 from gridreg.rendering.cameras import Camera, Lens
 from gridreg.rendering.model import Model
 from tests.export_fields import MaskedBall, ball_model

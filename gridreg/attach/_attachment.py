@@ -78,7 +78,7 @@ class Attachment:
         # What belonged to tensors that are gone would not fit the field that loads the state.
         used = {id(slot) for binding in self.bindings for _, slot in binding.slots}
         self._slots = {key: slot for key, slot in self._slots.items() if id(slot) in used}
-        copies = [copy for follower in self._followers if (copy := follower()) is not None]
+        copies = self._copies()
         self._placed = []
         try:
             for binding in self.bindings:
@@ -113,8 +113,11 @@ class Attachment:
 
     def modules(self) -> dict[int, nn.Module]:
         """All modules of the field and of the copies that follow it, by identity."""
-        fields = [self.field, *(copy for follower in self._followers if (copy := follower()) is not None)]
-        return {id(module): module for field in fields for module in field.modules()}
+        return {id(module): module for field in (self.field, *self._copies()) for module in field.modules()}
+
+    def _copies(self) -> list[nn.Module]:
+        """The copies that follow the field and are still there."""
+        return [copy for follower in self._followers if (copy := follower()) is not None]
 
     def _resolved(self, binding: Binding) -> tuple[list[Match], list[tuple[Match, Slot]]]:
         """The grids that a regularizer reads, and a slot for each tensor that it transforms."""
@@ -199,7 +202,7 @@ class Attachment:
         for binding in self.bindings:
             with binding.naming():
                 self._on_copies(binding, [copy])
-        if all(copy is not follower() for follower in self._followers):
+        if all(copy is not known for known in self._copies()):
             self._followers.append(ref(copy))
         if not self._suspensions:
             self.detach()

@@ -28,22 +28,23 @@ from gridreg.errors import InputError
 __all__ = ["attach", "detach", "open_channels", "slots_of", "strip"]
 
 
-class OutputHook:
-    """Forward hook that passes a module's output, or one item of it, through a slot."""
+class Hook:
+    """Base of both hooks: a slot, and which tensor of several passes through it."""
 
     def __init__(self, slot: Slot, item: int | str | None) -> None:
         self.slot, self.item = slot, item
+
+
+class OutputHook(Hook):
+    """Forward hook that passes a module's output, or one item of it, through a slot."""
 
     def __call__(self, module: nn.Module, arguments: Any, output: Any) -> Any:
         """The changed output, or None to leave it alone."""
         return _changed(self.slot, module, output, self.item)
 
 
-class InputHook:
+class InputHook(Hook):
     """Forward pre-hook that passes one argument of a module, by default its first tensor, through a slot."""
-
-    def __init__(self, slot: Slot, item: int | str | None) -> None:
-        self.slot, self.item = slot, item
 
     def __call__(self, module: nn.Module, arguments: tuple[Any, ...], keywords: dict[str, Any]) -> Any:
         """The changed arguments, or None to leave them alone."""
@@ -151,7 +152,7 @@ def detach(module: nn.Module, owner: str | None) -> list[tuple[nn.Module, str, S
         (module._forward_pre_hooks, module._forward_pre_hooks_with_kwargs),
     ):
         for key, hook in list(hooks.items()):
-            if isinstance(hook, (OutputHook, InputHook)) and owner in (None, hook.slot.owner):
+            if isinstance(hook, Hook) and owner in (None, hook.slot.owner):
                 taken.append((module, "", hook.slot))
                 del hooks[key]
                 extra.pop(key, None)
@@ -215,7 +216,7 @@ def slots_of(module: nn.Module) -> Iterator[Slot]:
     for stack in module.__dict__.get(STACKS, {}).values():
         yield from stack
     for hook in (*module._forward_hooks.values(), *module._forward_pre_hooks.values()):
-        if isinstance(hook, (OutputHook, InputHook)):
+        if isinstance(hook, Hook):
             yield hook.slot
 
 

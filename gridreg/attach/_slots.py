@@ -245,11 +245,13 @@ class _Shared(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, raw: Tensor, holder: _Holder) -> Tensor:
+        """The transformed tensor, without its graph."""
         ctx.holder = holder
         return holder.target.detach()
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, None]:
+        """The parameter's gradient, through the graph that is kept."""
         holder = ctx.holder
         holder.stack.forget()
         # Of an embedding with few rows read, which torch.where would not take.

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
 from functools import partial
+from html import escape
 from types import TracebackType
 from typing import Any
 
@@ -14,7 +15,6 @@ from torch import Tensor, nn
 
 from gridreg.attach._binding import Binding, site_label
 from gridreg.attach._parts import HandleParts
-from gridreg.attach._table import html_table, table
 from gridreg.base import Regularizer
 from gridreg.errors import InputError
 from gridreg.schedules import Schedule, drawing_axes
@@ -231,13 +231,13 @@ class Handle(HandleParts):
         """A table: regularizer, site, channels, value now, and whether it has acted yet."""
         if self._attachment.removed:
             return repr(self)
-        return f"gridreg on {self._title}\n{table(_HEAD, self._rows())}"
+        return f"gridreg on {self._title}\n{_table(_HEAD, self._rows())}"
 
     def _repr_html_(self) -> str:
         """The table as notebooks show it."""
         if self._attachment.removed:
-            return html_table(repr(self), (), ())
-        return html_table(f"gridreg on {self._title}", _HEAD, self._rows())
+            return _html_table(repr(self), (), ())
+        return _html_table(f"gridreg on {self._title}", _HEAD, self._rows())
 
     def _rows(self) -> list[tuple[str, ...]]:
         skipped = [
@@ -264,3 +264,30 @@ def _cells(binding: Binding) -> tuple[str, ...]:
     value = "?" if math.isnan(binding.value()) else f"{binding.value():.4g}"
     name = type(binding.regularizer).__name__
     return name, binding.label or "samples", channels or "-", value, binding.idle or "yes"
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Columns as wide as their cells, the head underlined.
+
+    >>> print(_table(("site", "value"), [("density", "0.5")]))
+    site     value
+    -------  -----
+    density  0.5
+    """
+    lines = [list(head), *map(list, rows)]
+    widths = [max(len(line[i]) for line in lines) for i in range(len(head))]
+    lines.insert(1, ["-" * width for width in widths])
+    texts = ("  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)) for line in lines)
+    return "\n".join(text.rstrip() for text in texts)
+
+
+def _html_table(title: str, head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """The same as a small HTML table with a caption, for notebooks.
+
+    >>> _html_table("t", ("a",), [("<1>",)])
+    '<table><caption>t</caption><tr><th>a</th></tr><tr><td>&lt;1&gt;</td></tr></table>'
+    """
+    lines = ["".join(f"<th>{escape(cell)}</th>" for cell in head)]
+    lines += ["".join(f"<td>{escape(cell)}</td>" for cell in row) for row in rows]
+    body = "".join(f"<tr>{line}</tr>" for line in lines)
+    return f"<table><caption>{escape(title)}</caption>{body}</table>"

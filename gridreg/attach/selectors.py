@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 from torch import Tensor, nn
 
@@ -75,7 +75,9 @@ def parameters(
         raise InputError(
             f"parameters({glob!r}, item={item!r}): expected the axis of the grids as well, stack=..."
         )
-    return _selector("parameters", glob, dim, channels, octaves, spatial, item, stack)
+    return _selector(
+        "parameters", glob, dim, channels=channels, octaves=octaves, spatial=spatial, item=item, stack=stack
+    )
 
 
 def outputs(
@@ -91,7 +93,7 @@ def outputs(
     Only calls count (`encoder(x)`), not `encoder.forward(x)`. Arguments as in `parameters`; `item` is the
     index or key where a module returns a tuple or a dict.
     """
-    return _selector("outputs", glob, dim, channels, octaves, None, item)
+    return _selector("outputs", glob, dim, channels=channels, octaves=octaves, item=item)
 
 
 def inputs(
@@ -109,35 +111,21 @@ def inputs(
     >>> print(inputs("mlp.0", channels=slice(30, 150)))
     inputs('mlp.0', dim=-1, channels='30:150')
     """
-    return _selector("inputs", glob, dim, channels, octaves, None, item)
+    return _selector("inputs", glob, dim, channels=channels, octaves=octaves, item=item)
 
 
-def _selector(
-    kind: Kind,
-    glob: str,
-    dim: int,
-    channels: slice | Sequence[int] | str | None,
-    octaves: Sequence[int] | None,
-    spatial: Sequence[int] | None,
-    item: int | str | None,
-    stack: int | None = None,
-) -> Selector:
-    """Check and normalise the arguments of the three functions above."""
+def _selector(kind: Kind, glob: str, dim: int, **options: Any) -> Selector:
+    """Check and normalise the arguments of the three functions above, which have the types."""
+    stack, channels = options.pop("stack", None), options.pop("channels")
     if not isinstance(glob, str):
         raise InputError(f"{kind}({glob!r}): expected a name or glob as text")
     for name, axis, what in (("dim", dim, "the channel axis"), ("stack", stack, "the axis of the grids")):
         if isinstance(axis, bool) or not isinstance(axis, int if name == "dim" else int | None):
             raise InputError(f"{kind}({glob!r}, {name}={axis!r}): expected {what} as an int")
-    return Selector(
-        kind,
-        glob,
-        dim,
-        channels=_normalised_channels(channels),
-        octaves=None if octaves is None else tuple(int(octave) for octave in octaves),
-        spatial=None if spatial is None else tuple(int(axis) for axis in spatial),
-        item=item,
-        stack=stack,
-    )
+    for name in ("octaves", "spatial"):
+        if options.get(name) is not None:
+            options[name] = tuple(int(number) for number in options[name])
+    return Selector(kind, glob, dim, channels=_normalised_channels(channels), stack=stack, **options)
 
 
 def _normalised_channels(channels: slice | Sequence[int] | str | None) -> tuple[int, ...] | str | None:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal, TypeAlias
+from functools import lru_cache
+from typing import Literal, TypeAlias, get_args, get_origin, get_type_hints
 
 import torch
 from torch import Tensor
@@ -156,3 +157,35 @@ def spatial_axes(
     if entries_by_features or any(tensor.shape[axis] > _LONGEST_EDGE for axis in axes):
         return ()
     return tuple(axis for axis in axes if tensor.shape[axis] > 1)
+
+
+NOT_NEGATIVE = (0.0, float("inf"))
+"""A range for `within`."""
+
+
+def within(**ranges: tuple[float, float]) -> Mapping[str, tuple[float, float]]:
+    """Lowest and highest values by the name of a field: for `Regularizer.ranges`."""
+    return ranges
+
+
+@lru_cache
+def choices_of(cls: type[object]) -> dict[str, tuple[str, ...]]:
+    """Fields that are one of several texts, by their annotation."""
+    try:
+        hints = get_type_hints(cls)
+    except NameError:  # Names that are imported for type checkers alone.
+        return {}
+    return {name: get_args(hint) for name, hint in hints.items() if get_origin(hint) is Literal}
+
+
+def check_site(value: object) -> None:
+    """Refuse what is not a site.
+
+    Raises:
+        InputError: naming the value and the four ways to name a site.
+    """
+    if not isinstance(value, (str, Selector, Site)):
+        raise InputError(
+            f"site={abridged(value)}: expected the name of a declared site, or "
+            "gridreg.parameters(...), gridreg.outputs(...) or gridreg.inputs(...)"
+        )

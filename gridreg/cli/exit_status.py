@@ -49,6 +49,7 @@ class _Output:
         self.error: OSError | None = None
 
     def write(self, text: str) -> int:
+        """Write text, with controls and what the encoding lacks escaped; an error is kept for later."""
         # Every second part is one that passes.
         parts = self.passing.split(text)
         parts[::2] = [_CONTROL.sub(lambda m: one_line(m[0]), part) for part in parts[::2]]
@@ -58,6 +59,7 @@ class _Output:
         return len(text)
 
     def flush(self) -> None:
+        """Hand on what is buffered; an error is kept for later."""
         self._try(self.stream.flush)
 
     def _try(self, act: Callable[..., Any], *arguments: Any) -> None:

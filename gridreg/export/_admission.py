@@ -64,6 +64,7 @@ class Admission:
 
         def serve(handler: Any, *address: Any, process_request: Any, **options: Any) -> Any:
             async def bounded(connection: Any) -> None:
+                """Handle a connection, of which only admissible messages arrive."""
                 connection.recv = bounded_receive(connection.recv)
                 await handler(connection)
 
@@ -158,6 +159,7 @@ def bounded_receive(receive: Callable[[], Awaitable[Any]]) -> Callable[[], Await
     began, count = time.monotonic(), 0
 
     async def bounded() -> bytes:
+        """The next admissible message."""
         nonlocal began, count
         while True:
             raw = await receive()

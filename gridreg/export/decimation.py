@@ -40,11 +40,15 @@ def decimate(vertices: Vertices, faces: Indices, count: int) -> tuple[Vertices, 
     Raises:
         InputError: if so few faces enclose nothing any more.
     """
-    fewer = trimesh.Trimesh(vertices, faces, process=False).simplify_quadric_decimation(face_count=count)
-    kept = _without_folds(np.asarray(fewer.faces, dtype=np.int64))
-    if not len(kept):
-        raise InputError(f"faces={count}: so few leave nothing of the shape, expected more")
-    left, kept = _cut_to_manifold(np.asarray(fewer.vertices), kept)
+    left, kept, before = vertices, faces, len(faces) + 1
+    # The library may stop early where nothing can be collapsed that is not in the way of something else.
+    while len(kept) < before and (left is vertices or len(kept) > count):
+        before = len(kept)
+        fewer = trimesh.Trimesh(left, kept, process=False).simplify_quadric_decimation(face_count=count)
+        kept = _without_folds(np.asarray(fewer.faces, dtype=np.int64))
+        if not len(kept):
+            raise InputError(f"faces={count}: so few leave nothing of the shape, expected more")
+        left, kept = _cut_to_manifold(np.asarray(fewer.vertices), kept)
     nearest = KDTree(vertices).query(left)[1]
     return left, kept, np.asarray(nearest, dtype=np.int64)
 

@@ -12,12 +12,12 @@ import torch
 import trimesh
 from numpy.typing import NDArray
 from PIL import Image
+from trimesh.exchange.gltf import export_glb
 from trimesh.exchange.obj import export_obj
 from trimesh.visual import TextureVisuals
-from trimesh.visual.material import SimpleMaterial
+from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
 from gridreg.errors import InputError, silenced
-from gridreg.export._glb import Y_UP, glb_of, srgb_of
 from gridreg.export.crop_box import checked_crop
 from gridreg.export.decimation import check_faces
 from gridreg.export.mesh import Mesh, extract_mesh
@@ -35,6 +35,9 @@ MESH_SUFFIXES = (".ply", ".obj", ".glb", ".stl")
 
 READABLE = (*MESH_SUFFIXES, ".off", ".gltf")
 """Formats that `read_mesh` reads."""
+
+# From a world with z up to one with y up.
+_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 TEXTURED = (".obj", ".glb")
 """Formats that have a texture."""
@@ -63,7 +66,7 @@ def save_mesh(mesh: Mesh, path: str | Path) -> None:
     _check_target(path, None if mesh.texture is None else 1)
     with writing(path) as temporary:
         if kind == ".glb":
-            content = glb_of(mesh)
+            content = _glb(mesh)
         elif mesh.texture is not None:
             content = _textured_obj(mesh, path)
         else:
@@ -72,6 +75,40 @@ def save_mesh(mesh: Mesh, path: str | Path) -> None:
             scaled.export(temporary, file_type=kind[1:])
             content = _commented(temporary.read_bytes(), kind, f"gridreg, {mesh.size}".encode())
         temporary.write_bytes(content)
+
+
+def _glb(mesh: Mesh) -> bytes:
+    """Return a binary glTF 2.0 file: y is up, colours are linear.
+
+    These are floats, as the 8 bits that trimesh writes show steps in the dark once they are linear.
+    """
+    # trimesh's visuals and exporters have no types.
+    surface: Any = PBRMaterial(metallicFactor=0.0, roughnessFactor=1.0)  # type: ignore[no-untyped-call]
+    surface.baseColorTexture = None if mesh.texture is None else Image.fromarray(mesh.texture)
+    visual: Any = TextureVisuals(uv=mesh.places, material=surface)  # type: ignore[no-untyped-call]
+    made = trimesh.Trimesh(mesh.vertices @ _Y_UP.T, mesh.faces, visual=visual, process=False)
+    if mesh.colours is not None:
+        made.vertex_attributes["_linear"] = _linear(mesh.colours / 255).astype("<f4")
+
+    def finish(tree: dict[str, Any]) -> None:
+        tree["asset"] |= {"generator": "gridreg", "extras": {"size": mesh.size}}
+        attributes = tree["meshes"][0]["primitives"][0]["attributes"]
+        if "_linear" in attributes:
+            attributes["COLOR_0"] = attributes.pop("_linear")
+
+    content = export_glb(trimesh.Scene(made), include_normals=False, tree_postprocessor=finish)  # type: ignore[no-untyped-call]
+    return bytes(content)
+
+
+def _srgb(linear: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return linear colours of 8 bits as sRGB (IEC 61966-2-1)."""
+    x = linear / 255
+    encoded = np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
+    return np.asarray(np.round(255 * encoded), dtype=np.uint8)
+
+
+def _linear(srgb: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
 def _textured_obj(mesh: Mesh, path: Path) -> bytes:
@@ -207,5 +244,5 @@ def read_mesh(path: str | Path) -> Mesh:
     if visual.kind == "vertex":
         colours = np.asarray(visual.vertex_colors, dtype=np.uint8)[:, :3]
     if kind in ("glb", "gltf"):
-        vertices, colours = vertices @ Y_UP, None if colours is None else srgb_of(colours)
+        vertices, colours = vertices @ _Y_UP, None if colours is None else _srgb(colours)
     return Mesh(vertices, faces, colours)

@@ -21,12 +21,11 @@ from gridreg.export._admission import Admission
 from gridreg.export.browser import quiet_console, start_server
 from gridreg.export.cameras import orbit_of_box, orbit_of_views
 from gridreg.export.images import z_depth
-from gridreg.export.pace import Pace
 from gridreg.export.preview import Preview
 from gridreg.export.training_cameras import TrainingCameras
 from gridreg.export.viewer_crop import CropControls
 from gridreg.export.viewer_panel import Look, Panel
-from gridreg.export.viewer_screen import Screen, composed
+from gridreg.export.viewer_screen import Pace, Screen, composed
 from gridreg.rendering import Rendered
 from gridreg.rendering.cameras import Camera
 from gridreg.rendering.model import Model

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from gridreg.base import register
 from gridreg.errors import InputError
-from gridreg.regularizers.penalty_base import SamplesPenalty
+from gridreg.regularizers.rays import SamplesPenalty
 from gridreg.samples import RaySamples
 from gridreg.schedules import Numeric
 

@@ -22,11 +22,13 @@ class _ScaledGradient(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, value: Tensor, path: Tensor, factor: Tensor | None) -> Tensor:
+        """The value."""
         ctx.factor = factor
         return value.view_as(value)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[None, Tensor, None]:
+        """The path's gradient, times the factor."""
         return None, gradients[0] if ctx.factor is None else gradients[0] * ctx.factor, None
 
 

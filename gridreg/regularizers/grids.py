@@ -53,6 +53,7 @@ class _Orthogonality(Function):
 
     @staticmethod
     def forward(ctx: Any, lines: Tensor) -> Tensor:
+        """Mean absolute value of the products off the diagonal, for lines ``(R, M)``."""
         products = (lines @ lines.T).fill_diagonal_(0)
         ctx.save_for_backward(lines, products)
         return products.abs().sum() / (len(lines) * (len(lines) - 1))
@@ -60,6 +61,7 @@ class _Orthogonality(Function):
     @staticmethod
     @once_differentiable  # type: ignore[untyped-decorator]
     def backward(ctx: Any, upstream: Tensor) -> Tensor:
+        """Each line's gradient: the others, with the signs of the products."""
         lines, products = ctx.saved_tensors
         gradient: Tensor = (products.sign() @ lines) * (2 * upstream / (len(lines) * (len(lines) - 1)))
         return gradient

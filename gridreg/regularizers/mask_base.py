@@ -136,21 +136,25 @@ class _ScaledGradient(torch.autograd.Function):
 
     @staticmethod
     def forward(value: Tensor, mask: Tensor) -> Tensor:
+        """A copy of the value."""
         # No view: a network may write into it in place (nn.ReLU(inplace=True)).
         return value.clone()
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
+        """Keep the mask for both modes of differentiation."""
         ctx.save_for_backward(inputs[1])
         ctx.save_for_forward(inputs[1])
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        """The gradient times the mask."""
         (mask,) = ctx.saved_tensors
         return torch.where(mask != 0, gradient * mask, 0.0), None
 
     @staticmethod
     def jvp(ctx: Any, tangent: Tensor, _: None) -> Tensor:
+        """The tangent times the mask."""
         (mask,) = ctx.saved_tensors
         return torch.where(mask != 0, tangent * mask, 0.0)
 

@@ -9,8 +9,7 @@ from torch.nn import functional as F
 
 from gridreg.base import register
 from gridreg.errors import InputError
-from gridreg.regularizers.penalty_base import SamplesPenalty
-from gridreg.regularizers.rays import TINY, alpha_of
+from gridreg.regularizers.rays import TINY, SamplesPenalty, alpha_of
 from gridreg.samples import RaySamples
 from gridreg.schedules import Geometric, Numeric
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -11,7 +11,6 @@ from torch.autograd.function import once_differentiable
 
 from gridreg.base import Context, Regularizer, register, within
 from gridreg.errors import InputError
-from gridreg.regularizers.penalty_base import SamplesPenalty
 from gridreg.samples import RaySamples
 from gridreg.schedules import Numeric
 from gridreg.segments import before_less_behind
@@ -20,6 +19,7 @@ __all__ = [
     "DistortionLoss",
     "OpacityEntropy",
     "RayEntropy",
+    "SamplesPenalty",
     "distortion",
     "opacity_entropy",
     "ray_entropy",
@@ -102,6 +102,7 @@ class _Distortion(torch.autograd.Function):
     def forward(
         ctx: Any, weights: Tensor, t: Tensor, delta: Tensor, offsets: Tensor, ray_indices: Tensor
     ) -> Tensor:
+        """Scalar, in units of t; all but the offsets are ``(N,)``."""
         w, wide = weights.double(), t.double()
         lead = before_less_behind(w, offsets, ray_indices)
         away = (wide * lead).sub_(before_less_behind(w * wide, offsets, ray_indices))
@@ -112,6 +113,7 @@ class _Distortion(torch.autograd.Function):
     @staticmethod
     @once_differentiable  # type: ignore[untyped-decorator]
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        """Gradients of weights, t and delta, where they are asked for."""
         w, lead, away, within = ctx.saved_tensors
         wanted = ctx.needs_input_grad
         of_weights = (away + within / 3).mul_(2 * gradient) if wanted[0] else None
@@ -149,6 +151,23 @@ def distortion(samples: RaySamples, near: float | None = None, far: float | None
         samples.weights, samples.t, samples.lengths, samples.offsets, samples.ray_indices
     )
     return total * (scale / max(samples.rays, 1))
+
+
+@dataclass(frozen=True)
+class SamplesPenalty(Regularizer):
+    """Base of penalties that are a function of the samples alone.
+
+    Class attributes:
+        function: the penalty without its weight, of `RaySamples` alone, as a static method.
+    """
+
+    function: ClassVar[Any]
+    example_arguments = ({},)
+
+    def penalty(self, samples: RaySamples, context: Context) -> Tensor:
+        """The function of the samples."""
+        found: Tensor = self.function(samples)
+        return found
 
 
 @register

@@ -144,6 +144,7 @@ class _Loader(yaml.SafeLoader):
     yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012  (PyYAML's own mechanism)
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        """The next node; aliases, anchors and tags are refused."""
         event: Any = self.peek_event()  # type: ignore[no-untyped-call]
         if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None) is not None:
             self._refuse("anchors and aliases (& and *) are not supported; write the value out", event)
@@ -159,9 +160,11 @@ class _Dumper(yaml.SafeDumper):
     """SafeDumper that quotes what YAML 1.1 or 1.2 would read as something else, and writes no aliases."""
 
     def ignore_aliases(self, data: Any) -> bool:
+        """Write out what stands in several places."""
         return True
 
     def represent_text(self, data: str) -> yaml.ScalarNode:
+        """The text as a scalar that reads back as it is."""
         # Only the double-quoted style keeps every line break (U+0085, U+2028) and control character.
         style = None if data.isprintable() else '"'
         return self.represent_scalar("tag:yaml.org,2002:str", data, style=style)

@@ -118,6 +118,7 @@ class _Reader:
         self.locating = document.locating
 
     def build(self, cls: type[T], data: Any, path: KeyPath, base: T | None) -> T:
+        """An instance of ``cls``, or an error that names the key below ``path``."""
         if not isinstance(data, Mapping):
             raise self.error(path, f"found {_shown(data)}, expected a mapping of keys to values")
         hints = field_types(cls)
@@ -186,6 +187,7 @@ class _Reader:
         return value
 
     def convert_tuple(self, value: Any, arguments: tuple[Any, ...], path: KeyPath) -> tuple[Any, ...]:
+        """The items as the declared types of a tuple."""
         if len(arguments) == 2 and arguments[1] is Ellipsis:
             arguments = (arguments[0],) * len(value)
         elif len(arguments) != len(value):
