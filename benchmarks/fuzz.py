@@ -43,36 +43,25 @@ class Campaign:
     Attributes:
         corpus: folder for the files of what failed.
         base: memory that the process held before the first input, MB.
-        counts: of each format, how many were refused, accepted and failed.
-        seconds: the most processor time that an input took, of each format.
-        megabytes: the most memory above ``base``, likewise.
-        said: kinds of failures, with how often each was seen.
+        seen: verdicts by format.
     """
 
     corpus: Path
     base: float = 0.0
-    counts: dict[str, Counter[str]] = field(default_factory=dict)
-    seconds: dict[str, float] = field(default_factory=dict)
-    megabytes: dict[str, float] = field(default_factory=dict)
-    said: Counter[str] = field(default_factory=Counter)
+    seen: dict[str, list[Verdict]] = field(default_factory=dict)
 
     @property
-    def total(self) -> Counter[str]:
-        """Outcomes of all formats together."""
-        return sum(self.counts.values(), Counter[str]())
+    def total(self) -> int:
+        """Number of inputs."""
+        return sum(map(len, self.seen.values()))
 
     def add(self, item: Input, verdict: Verdict) -> None:
         """Count an input and keep one that failed."""
-        kind = item.kind
-        tally = self.counts.setdefault(kind, Counter())
-        tally[verdict.outcome] += 1
-        self.seconds[kind] = max(self.seconds.get(kind, 0.0), verdict.seconds)
-        self.megabytes[kind] = max(self.megabytes.get(kind, 0.0), verdict.megabytes)
+        self.seen.setdefault(item.kind, []).append(verdict)
         if verdict.outcome == "failed":
-            self.said[f"{kind}: {verdict.said[:60]}"] += 1
-            place = self.corpus / f"{kind.replace(' ', '_').replace('.', '_')}-{self.total.total()}.json"
+            place = self.corpus / f"{item.kind.replace(' ', '_').replace('.', '_')}-{self.total}.json"
             store(item, verdict.said, place)
-            print(f"{kind}: {verdict.said} ({place})", file=sys.stderr, flush=True)
+            print(f"{item.kind}: {verdict.said} ({place})", file=sys.stderr, flush=True)
 
     def round(self, number: int, count: int, keep: bool = True) -> None:
         """Judge inputs; the number is their seed."""
@@ -96,19 +85,26 @@ class Campaign:
 
     def record(self, first_seed: int, began: float) -> dict[str, Any]:
         """Return the figures as plain data."""
-        formats = {
-            kind: {"tried": tally.total(), **{o: tally[o] for o in ("refused", "accepted", "failed")}}
-            | {"seconds": round(self.seconds[kind], 2), "megabytes": round(self.megabytes[kind])}
-            for kind, tally in sorted(self.counts.items())
-        }
+        formats = {}
+        for kind, verdicts in sorted(self.seen.items()):
+            outcomes = [verdict.outcome for verdict in verdicts]
+            formats[kind] = {
+                "tried": len(verdicts),
+                **{outcome: outcomes.count(outcome) for outcome in ("refused", "accepted", "failed")},
+                "seconds": round(max(verdict.seconds for verdict in verdicts), 2),
+                "megabytes": round(max(verdict.megabytes for verdict in verdicts)),
+            }
+        said = Counter(
+            f"{kind}: {v.said[:60]}" for kind, own in self.seen.items() for v in own if v.outcome == "failed"
+        )
         return {
-            "tried": self.total.total(),
-            "failed": self.total["failed"],
+            "tried": self.total,
+            "failed": said.total(),
             "first_seed": first_seed,
             "seconds": round(time.monotonic() - began),
             "base_megabytes": round(self.base),
             "formats": formats,
-            "failures": dict(self.said.most_common(20)),
+            "failures": dict(said.most_common(20)),
             "versions": versions(),
         }
 
@@ -127,7 +123,7 @@ def main() -> None:
     campaign.round(10**6 + options.seed, WARM_UP * ROUND, keep=False)
     campaign.base = memory()[0]
     number = options.seed
-    while campaign.total.total() < options.inputs or time.monotonic() < end:
+    while campaign.total < options.inputs or time.monotonic() < end:
         campaign.round(number, ROUND)
         number += 1
         stored.save("fuzz", f"seed {options.seed}", campaign.record(options.seed, began), options.results)

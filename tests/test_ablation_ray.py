@@ -160,7 +160,7 @@ def test_a_task_on_a_worker(tmp_path):
     # A scene that was shipped is not looked for.
     scene = Scenes(tmp_path).get(spec)
     shipped = replace(spec, scene="/nowhere/lighthouse_32")
-    assert run_task(task(shipped), [lambda: scene]).metrics["images"] == result.metrics["images"]
+    assert run_task(task(shipped), lambda: scene).metrics["images"] == result.metrics["images"]
     failed = run_task(task(replace(spec, scene="/nowhere/another")))
     assert failed.metrics is None
     assert "scene another: not on" in failed.reason

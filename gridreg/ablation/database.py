@@ -45,18 +45,15 @@ class Database:
 
     Args:
         path: of the file.
-        create: make it if it is not there.
         wait: seconds to wait for other writers.
 
     Raises:
-        InputError: if it is missing, corrupt, locked, read-only, written by a newer gridreg, or no store.
+        InputError: if it is corrupt, locked, read-only, written by a newer gridreg, or no store.
     """
 
-    def __init__(self, path: Path, *, create: bool = True, wait: float = 20.0) -> None:
+    def __init__(self, path: Path, *, wait: float = 20.0) -> None:
         self.path = path
         self.wait = wait
-        if not create and not path.is_file():
-            raise InputError(f"{path}: no such file; expected the database of a store")
         with self.reading() as connection:
             # Before anything is written: what is not ours is left as it is.
             self._is_ours(connection)

@@ -77,23 +77,23 @@ class Scenes:
         self._cache, self._device = cache, device
         self._kept: OrderedDict[tuple[Any, ...], Scene] = OrderedDict()
 
-    def get(self, spec: RunSpec) -> Scene:
+    def get(self, spec: RunSpec, fetch: Callable[[], Scene] | None = None) -> Scene:
         """The scene of a run.
+
+        Args:
+            spec: the run.
+            fetch: gets the scene where it comes by another way than from its folder.
 
         Raises:
             InputError: if it cannot be read.
         """
         key = scene_key(spec)
         if key not in self._kept:
-            self.put(spec, self._load(spec))
+            self._kept[key] = self._load(spec) if fetch is None else fetch()
+            while len(self._kept) > _KEPT:
+                self._kept.popitem(last=False)
         self._kept.move_to_end(key)
         return self._kept[key]
-
-    def put(self, spec: RunSpec, scene: Scene) -> None:
-        """Keep a scene that came by another way."""
-        self._kept[scene_key(spec)] = scene
-        while len(self._kept) > _KEPT:
-            self._kept.popitem(last=False)
 
     def _load(self, spec: RunSpec) -> Scene:
         if spec.scene is None:

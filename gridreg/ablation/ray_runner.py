@@ -176,7 +176,7 @@ class _Queue:
 def _remote(task: Task, scene: list[Any]) -> TaskResult:
     import ray
 
-    return run_task(task, [lambda: ray.get(scene[0])] if scene else [])
+    return run_task(task, (lambda: ray.get(scene[0])) if scene else None)
 
 
 def _line(error: BaseException) -> str:

@@ -7,7 +7,7 @@ import functools
 import importlib
 import shutil
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -43,12 +43,12 @@ class Task:
     modules: tuple[str, ...]
 
 
-def run_task(task: Task, fetch_scene: Sequence[Callable[[], Scene]] = ()) -> TaskResult:
+def run_task(task: Task, fetch_scene: Callable[[], Scene] | None = None) -> TaskResult:
     """Do a run in a temporary folder.
 
     Args:
         task: the run.
-        fetch_scene: gets the scene where it was shipped; nothing: it is found by path.
+        fetch_scene: gets the scene where it was shipped; None: it is found by path.
     """
     torch.set_num_threads(task.threads)
     spec = RunSpec.from_json(task.spec)
@@ -58,8 +58,8 @@ def run_task(task: Task, fetch_scene: Sequence[Callable[[], Scene]] = ()) -> Tas
         try:
             for module in task.modules:
                 importlib.import_module(module)
-            for fetch in fetch_scene:
-                _worker_scenes().put(spec, fetch())
+            if fetch_scene is not None:
+                _worker_scenes().get(spec, fetch_scene)
         except Exception as error:
             return TaskResult(reason=f"{type(error).__name__}: {error}", files=task.files)
         result = perform(spec, folder, _worker_scenes(), log=True)

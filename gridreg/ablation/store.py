@@ -66,7 +66,7 @@ class Store:
             raise InputError(
                 f"{path}: holds no store ({_DATABASE} is missing); expected the output folder of a study"
             )
-        return Store(path, Database(path / _DATABASE, create=create, wait=wait))
+        return Store(path, Database(path / _DATABASE, wait=wait))
 
     def run_folder(self, spec_hash: str) -> Path:
         """The folder of a run."""
