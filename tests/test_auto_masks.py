@@ -21,7 +21,8 @@ from gridreg.scenes.auto_masks import check_masks, cut_masks, draw_masks
 from gridreg.scenes.board import board_image, get_board
 from gridreg.scenes.frames import Frame
 from gridreg.scenes.lens import LensDistortion
-from gridreg.scenes.sheet_masks import SheetView, _print_at, cut_from_sheet
+from gridreg.scenes.sheet_masks import _print_at, cut_from_sheet
+from gridreg.scenes.sheet_views import SheetView
 from gridreg.scenes.transforms import read_transforms
 
 pytest.importorskip("cv2")

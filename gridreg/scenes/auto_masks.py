@@ -16,7 +16,8 @@ from gridreg.errors import InputError
 from gridreg.scenes.board import Board
 from gridreg.scenes.frames import Frame
 from gridreg.scenes.images import read_rgba
-from gridreg.scenes.sheet_masks import SheetView, cut_from_sheet
+from gridreg.scenes.sheet_masks import cut_from_sheet
+from gridreg.scenes.sheet_views import SheetView
 
 __all__ = ["MASKS", "Network", "check_masks", "cut_masks", "draw_masks"]
 
@@ -25,7 +26,7 @@ MASKS = ("auto", "none", "rembg")
 
 Mask = NDArray[np.bool_]
 
-_EDGE = 800
+_EDGE = 1600
 """Longer edge of the images that are cut, pixels."""
 _CELL, _COLUMNS = 360, 4
 # Mean and deviation of the channels that networks of rembg were trained with: ImageNet's, but for those called isnet.
@@ -83,7 +84,6 @@ def cut_masks(
     elif board is None or len(frames) < 3 or any(image.shape[2] == 4 for image in images):
         return frames, ""
     else:
-        _need("cv2", "photos", "masks from the sheet")
         masks = cut_from_sheet([_view(*pair) for pair in zip(frames, images, strict=True)], board)
         said = "masks from the sheet"
     if masks is None:

@@ -2,22 +2,24 @@
 
 A photograph of a plane tells its colours wherever another one sees the same place of it. Light and object do not move
 between photographs, so even shadows agree. What stands on the plane does not: pixels that two others contradict are
-object, or clutter beside the sheet, which the visual hull of all views leaves out. GrabCut settles the outline.
+object, or clutter beside the sheet, which the visual hull of all views leaves out. That is a guess to begin with.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage  # type: ignore[import-untyped]
 
 from gridreg.scenes.board import Board, board_image
-from gridreg.scenes.lens import LensDistortion
+from gridreg.scenes.mask_fusion import fuse_masks, normalised
+from gridreg.scenes.photo_hull import neighbouring
+from gridreg.scenes.sheet_views import SheetView
 
-__all__ = ["SheetView", "cut_from_sheet"]
+__all__ = ["cut_from_sheet"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -27,8 +29,8 @@ _DOTS = 4
 """Pixels of the drawn sheet, a millimetre."""
 _CLOSE = 0.06
 """Difference of two photographs of one place, of the white of paper, after gamma."""
-_REACH = 1.2
-"""Metres from the sheet's middle up to which the table is looked at."""
+_EDGE = 640
+"""Longer edge of the images that are looked at first, and in which the others' table is looked up."""
 _VOXELS = 128
 _OTHERS = 12
 """Photographs at most that each is compared with."""
@@ -36,93 +38,49 @@ _AROUND = np.ones((3, 3), dtype=bool)
 
 
 @dataclass
-class SheetView:
-    """A photograph with its camera in the sheet's metres, z up.
+class _Sorted:
+    """Pixels ``(H, W)`` that are table or sheet for sure, may be paper that nobody else sees, and rise above."""
 
-    Attributes:
-        rgb: ``(H, W, 3)`` uint8.
-        pose: ``(4, 4)`` camera-to-world, looking along -z, y up in the image.
-        intrinsics: fx, fy, cx, cy in pixels of this image.
-        lens: its distortion.
-    """
-
-    rgb: NDArray[np.uint8]
-    pose: Array
-    intrinsics: tuple[float, float, float, float]
-    lens: LensDistortion
-    colours: NDArray[np.float32] = field(init=False)
-    table: Mask = field(init=False)
-    paper: Mask = field(init=False)
-    above: Mask = field(init=False)
-
-    def pixels(self, points: Array) -> tuple[NDArray[np.int64], Mask]:
-        """Row and column ``(N, 2)`` of points ``(N, 3)``, and whether they are in the image."""
-        height, width = self.rgb.shape[:2]
-        fx, fy, cx, cy = self.intrinsics
-        local = (points - self.pose[:3, 3]) @ self.pose[:3, :3]
-        depth = -local[:, 2]
-        before = depth > 1e-6
-        x, y = local[:, 0] / np.where(before, depth, 1), -local[:, 1] / np.where(before, depth, 1)
-        # Far outside a lens folds back.
-        before &= np.hypot(x * fx, y * fy) < 1.2 * np.hypot(width, height)
-        x, y = self.lens.distort(np.where(before, x, 0), np.where(before, y, 0))
-        found = np.floor(np.stack([y * fy + cy, x * fx + cx], axis=-1)).astype(np.int64)
-        inside = before & (found >= 1).all(axis=1) & (found < (height - 1, width - 1)).all(axis=1)
-        found[~inside] = 0
-        return found, inside
-
-    def on_table(self) -> Array:
-        """Points ``(H, W, 3)`` in which the rays of all pixels meet the table, NaN far away and above."""
-        height, width = self.rgb.shape[:2]
-        fx, fy, cx, cy = self.intrinsics
-        bent = np.meshgrid((np.arange(width) + 0.5 - cx) / fx, (np.arange(height) + 0.5 - cy) / fy)
-        x, y = bent
-        for _ in range(20):
-            again = self.lens.distort(x, y)
-            x, y = x + bent[0] - again[0], y + bent[1] - again[1]
-        rays = np.stack([x, -y, -np.ones_like(x)], axis=-1) @ self.pose[:3, :3].T
-        length = -self.pose[2, 3] / np.where(rays[..., 2] < -1e-3, rays[..., 2], np.nan)
-        points: Array = self.pose[:3, 3] + length[..., None] * rays
-        points[np.linalg.norm(points[..., :2], axis=-1) > _REACH] = np.nan
-        points[..., 2] *= 0
-        return points
+    table: Mask
+    paper: Mask
+    above: Mask
 
 
 def cut_from_sheet(views: Sequence[SheetView], board: Board) -> list[Mask] | None:
-    """Masks ``(H, W)`` of what stands in the free middle of the sheet; None if nothing rises there.
+    """Return masks ``(H, W)`` of what stands in the free middle of the sheet; None if nothing rises there.
 
     Args:
-        views: at least three, about 800 pixels wide.
+        views: at least three.
         board: the sheet.
     """
     page = np.asarray(board_image(board, _DOTS) / 255, dtype=np.float64)
-    places = [view.on_table() for view in views]
+    small = [view.reduced(_EDGE) for view in views]
+    places = [view.on_table() for view in small]
     prints = [_print_at(place, board, page) for place in places]
-    for view, printed in zip(views, prints, strict=True):
+    whites = []
+    for view, printed in zip(small, prints, strict=True):
         white = ndimage.binary_erosion(printed > 0.98, np.ones((5, 5)))
         if not white.any():
             return None
-        linear = (view.rgb / np.float32(255)) ** np.float32(_GAMMA)
-        paper = np.percentile(linear[white], 70, axis=0).clip(1e-3)
-        view.colours = np.asarray((linear / paper) ** (1 / _GAMMA), dtype=np.float32)
+        linear = (view.rgb[white] / 255) ** _GAMMA
+        whites.append(np.percentile(linear, 70, axis=0).clip(1e-3))
+        view.colours = normalised(view.rgb, whites[-1])
     grid = _grid(board)
-    ranges = [
-        [f(view.colours, size=(3, 3, 1)) for f in (ndimage.minimum_filter, ndimage.maximum_filter)]
-        for view in views
-    ]
-    for i, (view, printed) in enumerate(zip(views, prints, strict=True)):
-        agreeing, seen = _agreement(i, views, places[i], ranges, _near_object(view, grid))
-        _sort_pixels(view, printed, agreeing, seen)
-    hull = _hull(views, grid)
+    ranges = [neighbouring(view.colours) for view in small]
+    pixels = []
+    for i, (view, printed) in enumerate(zip(small, prints, strict=True)):
+        agreeing, seen = _agreement(i, small, places[i], ranges, _near_object(view, grid))
+        pixels.append(_sort_pixels(view, printed, agreeing, seen))
+    hull = _hull(small, pixels, grid)
     if not hull.any():
         return None
     # White that is seen low above the paper is paper; higher up it is the object's.
     tall = grid[hull][:, 2]
-    for view in views:
+    guesses = []
+    for view, kinds in zip(small, pixels, strict=True):
         high = _projected(view, grid[hull][tall > 0.4 * tall.max()])
-        view.paper &= ~high
-        view.above |= high & ~view.table & ~view.paper
-    return [_grab(view, _projected(view, grid[hull])) for view in views]
+        guesses.append(_projected(view, grid[hull]) & ~kinds.table & (high | ~kinds.paper))
+    return fuse_masks(views, small, whites, guesses, board)
 
 
 def _print_at(places: Array, board: Board, page: Array) -> Array:
@@ -139,7 +97,7 @@ def _agreement(
     i: int,
     views: Sequence[SheetView],
     places: Array,
-    ranges: Sequence[Sequence[NDArray[np.float32]]],
+    ranges: Sequence[NDArray[np.float32]],
     near: Mask,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """By pixel ``near`` the object: how many others see the same colour at its place of the table, how many see it."""
@@ -158,8 +116,8 @@ def _agreement(
 
 def _sort_pixels(
     view: SheetView, printed: Array, agreeing: NDArray[np.int64], seen: NDArray[np.int64]
-) -> None:
-    """Set what is table or sheet for sure, what may be paper that nobody else sees, and what rises above."""
+) -> _Sorted:
+    """Return what is table or sheet for sure, what may be paper that nobody else sees, and what rises above."""
     colours = view.colours
     brightest = colours.max(axis=-1)
     # Ink, paper and shadows on it are grey; the object's own ground, which others see in the same place, is not.
@@ -169,12 +127,12 @@ def _sort_pixels(
     table = (agreeing + as_printed >= 2) & (grey | ~on_page)
     table = ndimage.binary_opening(table, _AROUND)
     apart = table & ~on_page & (agreeing >= 3) & (agreeing >= 0.7 * seen)
-    view.table = _larger(table, 3e-3) | _larger(ndimage.binary_opening(apart, _AROUND), 1e-4)
-    white = grey & (printed > 0.95) & ~view.table & (brightest > 0.4) & (brightest < 1.15)
+    table = _larger(table, 3e-3) | _larger(ndimage.binary_opening(apart, _AROUND), 1e-4)
+    white = grey & (printed > 0.95) & ~table & (brightest > 0.4) & (brightest < 1.15)
     labels, _ = ndimage.label(white)
-    beside = np.unique(labels[ndimage.binary_dilation(view.table, _AROUND) & white])
-    view.paper = np.isin(labels, beside[beside > 0])
-    view.above = (seen >= 2) & ~view.table & ~view.paper
+    beside = np.unique(labels[ndimage.binary_dilation(table, _AROUND) & white])
+    paper = np.isin(labels, beside[beside > 0])
+    return _Sorted(table, paper, (seen >= 2) & ~table & ~paper)
 
 
 def _near_object(view: SheetView, grid: Array) -> Mask:
@@ -207,15 +165,15 @@ def _grid(board: Board) -> Array:
     return grid
 
 
-def _hull(views: Sequence[SheetView], grid: Array) -> Mask:
+def _hull(views: Sequence[SheetView], sorted_pixels: Sequence[_Sorted], grid: Array) -> Mask:
     """The largest part of what is table in no view, and above it in half of those that see it."""
     points = grid.reshape(-1, 3)
     kept = np.ones(len(points), dtype=bool)
     above, seen = np.zeros((2, len(points)), dtype=np.int64)
-    for view in views:
+    for view, kinds in zip(views, sorted_pixels, strict=True):
         (rows, columns), inside = (found := view.pixels(points))[0].T, found[1]
-        kept &= ~(inside & view.table[rows, columns])
-        above += inside & view.above[rows, columns]
+        kept &= ~(inside & kinds.table[rows, columns])
+        above += inside & kinds.above[rows, columns]
         seen += inside
     kept &= (above >= 2) & (above >= 0.5 * seen)
     labels, _ = ndimage.label(kept.reshape(grid.shape[:3]), np.ones((3, 3, 3)))
@@ -236,25 +194,3 @@ def _projected(view: SheetView, points: Array) -> Mask:
     distance = float(np.linalg.norm(points - view.pose[:3, 3], axis=1).mean())
     reach = int(np.ceil(edge * view.intrinsics[0] / distance / 2)) + 1
     return np.asarray(ndimage.binary_closing(found, np.ones((2 * reach + 1,) * 2)))
-
-
-def _grab(view: SheetView, hull: Mask) -> Mask:
-    """The object within the projection of the hull, by GrabCut (Rother et al. 2004)."""
-    import cv2
-
-    near = ndimage.binary_dilation(hull, _AROUND, iterations=2)
-    labels = np.full(hull.shape, cv2.GC_BGD, dtype=np.uint8)
-    labels[near & ~view.table] = cv2.GC_PR_BGD
-    labels[hull & ~view.table & ~view.paper] = cv2.GC_PR_FGD
-    labels[ndimage.binary_erosion(view.above & hull, _AROUND, iterations=2)] = cv2.GC_FGD
-    if not (labels == cv2.GC_FGD).any() and not (labels == cv2.GC_PR_FGD).any():
-        return np.zeros_like(hull)
-    rows, columns = (np.flatnonzero(near.any(axis=axis)) for axis in (1, 0))
-    part = tuple(slice(max(0, int(at[0]) - 30), int(at[-1]) + 31) for at in (rows, columns))
-    cut = np.ascontiguousarray(labels[part])
-    models = np.zeros((1, 65)), np.zeros((1, 65))
-    # The models of colours are drawn at random.
-    cv2.setRNGSeed(0)
-    cv2.grabCut(np.ascontiguousarray(view.rgb[part][..., ::-1]), cut, None, *models, 3, cv2.GC_INIT_WITH_MASK)  # type: ignore[call-overload]
-    labels[part] = cut
-    return np.asarray((labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD))
