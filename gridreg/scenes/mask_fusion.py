@@ -16,16 +16,17 @@ from PIL import Image
 from scipy import ndimage  # type: ignore[import-untyped]
 
 from gridreg.scenes.board import Board
-from gridreg.scenes.photo_hull import COMPARED, carve, neighbouring
-from gridreg.scenes.sheet_views import SheetView
+from gridreg.scenes.photo_hull import carve, neighbouring
+from gridreg.scenes.sheet_views import COMPARED, SheetView, compared_with
 
-__all__ = ["fuse_masks", "normalised"]
+__all__ = ["GAMMA", "fuse_masks", "normalised"]
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-_GAMMA = 2.2
+GAMMA = 2.2
+"""Of the colours of photographs: light is their power of it."""
 _BINS, _TOP = 24, 1.3
 """Of histograms of colours, and the colour at which they end; the white of paper is 1."""
 _NOISE = 0.01
@@ -45,8 +46,8 @@ _AROUND = np.ones((3, 3), dtype=bool)
 
 def normalised(rgb: NDArray[np.uint8], white: Array) -> Floats:
     """Return colours ``(H, W, 3)`` with paper of the linear colour ``white`` at 1."""
-    linear = (rgb / np.float32(255)) ** np.float32(_GAMMA)
-    return np.asarray((linear / white) ** (1 / _GAMMA), dtype=np.float32)
+    linear = (rgb / np.float32(255)) ** np.float32(GAMMA)
+    return np.asarray((linear / white) ** (1 / GAMMA), dtype=np.float32)
 
 
 def fuse_masks(
@@ -150,8 +151,7 @@ def _table_behind(
     places = crop.on_table()
     met = np.isfinite(places[..., 0])
     points = places[met]
-    others = [j for j in range(len(small)) if j != i]
-    others = others[:: -(-len(others) // COMPARED)]
+    others = compared_with(i, len(small))
     colours = np.full((len(others), len(points), 3), np.inf, dtype=np.float32)
     wide = np.full((len(others), len(points)), np.inf, dtype=np.float32)
     for k, j in enumerate(others):

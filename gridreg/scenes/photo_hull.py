@@ -13,15 +13,13 @@ from numpy.typing import NDArray
 from scipy import ndimage  # type: ignore[import-untyped]
 
 from gridreg.scenes.board import Board
-from gridreg.scenes.sheet_views import SheetView
+from gridreg.scenes.sheet_views import SheetView, compared_with
 
-__all__ = ["COMPARED", "carve", "neighbouring"]
+__all__ = ["carve", "neighbouring"]
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
-COMPARED = 12
-"""Photographs at most that each is compared with."""
 _SAME = 0.06
 """Difference up to which two photographs show one surface, of the white of paper."""
 _COARSE = 4
@@ -52,7 +50,8 @@ def carve(
 
     Returns:
         For each view ``(H, W)``: the largest sum of evidence that others have for matter in a cell on the ray, and the
-        number of others, of `COMPARED`, in which the cell of the ray where most of them do has the pixel's colour.
+        number of others, of those it is compared with, in which the cell of the ray where most of them do has the
+        pixel's colour.
     """
     size = max(board.free)
     axes = [np.arange(_COARSE * cell / 2, length, _COARSE * cell) for length in (*board.free, size)]
@@ -83,8 +82,7 @@ def carve(
         near = seen & (others > 0)
         own = np.rint(view.colours[tuple(pixels[near].T)].clip(0, 1.25) * 200).astype(np.int16)
         count = np.zeros(len(own), dtype=np.int64)
-        compared = [j for j in range(len(views)) if j != i]
-        for j in compared[:: -(-len(compared) // COMPARED)]:
+        for j in compared_with(i, len(views)):
             low, high = around[j][:, near].astype(np.int16)
             count += ((own >= low - same) & (own <= high + same)).all(axis=-1) & places[j][1][near]
         most = np.zeros(view.rgb.shape[:2], dtype=np.int64)

@@ -15,16 +15,15 @@ from numpy.typing import NDArray
 from scipy import ndimage  # type: ignore[import-untyped]
 
 from gridreg.scenes.board import Board, board_image
-from gridreg.scenes.mask_fusion import fuse_masks, normalised
+from gridreg.scenes.mask_fusion import GAMMA, fuse_masks, normalised
 from gridreg.scenes.photo_hull import neighbouring
-from gridreg.scenes.sheet_views import SheetView
+from gridreg.scenes.sheet_views import SheetView, compared_with
 
 __all__ = ["cut_from_sheet"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_GAMMA = 2.2
 _DOTS = 4
 """Pixels of the drawn sheet, a millimetre."""
 _CLOSE = 0.06
@@ -32,8 +31,6 @@ _CLOSE = 0.06
 _EDGE = 640
 """Longer edge of the images that are looked at first, and in which the others' table is looked up."""
 _VOXELS = 128
-_OTHERS = 12
-"""Photographs at most that each is compared with."""
 _AROUND = np.ones((3, 3), dtype=bool)
 
 
@@ -62,7 +59,7 @@ def cut_from_sheet(views: Sequence[SheetView], board: Board) -> list[Mask] | Non
         white = ndimage.binary_erosion(printed > 0.98, np.ones((5, 5)))
         if not white.any():
             return None
-        linear = (view.rgb[white] / 255) ** _GAMMA
+        linear = (view.rgb[white] / 255) ** GAMMA
         whites.append(np.percentile(linear, 70, axis=0).clip(1e-3))
         view.colours = normalised(view.rgb, whites[-1])
     grid = _grid(board)
@@ -104,8 +101,7 @@ def _agreement(
     met = np.isfinite(places[..., 0]) & near
     points, colours = places[met], views[i].colours[met]
     agreeing, seen = np.zeros((2, *met.shape), dtype=np.int64)
-    others = [j for j in range(len(views)) if j != i]
-    for j in others[:: -(-len(others) // _OTHERS)]:
+    for j in compared_with(i, len(views)):
         (rows, columns), inside = (found := views[j].pixels(points))[0].T, found[1]
         low, high = (bound[rows, columns] for bound in ranges[j])
         off = np.maximum(low - colours, colours - high).max(axis=-1)

@@ -10,13 +10,26 @@ from PIL import Image
 
 from gridreg.scenes.lens import LensDistortion
 
-__all__ = ["SheetView"]
+__all__ = ["COMPARED", "SheetView", "compared_with"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _REACH = 1.2
 """Metres from the sheet's middle up to which the table is looked at."""
+
+COMPARED = 12
+"""Photographs at most that each is compared with."""
+
+
+def compared_with(i: int, count: int) -> list[int]:
+    """Return the photographs that the i-th of ``count`` is compared with: all others, or evenly some of them.
+
+    >>> compared_with(1, 4), len(compared_with(0, 40))
+    ([0, 2, 3], 10)
+    """
+    others = [j for j in range(count) if j != i]
+    return others[:: -(-len(others) // COMPARED)]
 
 
 @dataclass
