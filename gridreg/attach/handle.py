@@ -134,7 +134,7 @@ class Handle(HandleParts):
         self._live.remove()
 
     def __enter__(self) -> Handle:
-        self._bindings()
+        _ = self._live  # refuses a handle that was removed
         return self
 
     def __exit__(

@@ -23,9 +23,9 @@ from gridreg.ops.dispatch import operation
 __all__ = [
     "UNIT",
     "FeatureMeans",
+    "average_features",
     "merge_neighbours",
     "merge_samples",
-    "average_features",
     "spread_to_samples",
 ]
 

@@ -168,7 +168,7 @@ def _pad_front(axis: int) -> list[int]:
 
 
 def _footprint(total: Tensor, row: Tensor, column: Tensor, radius: Tensor) -> Tensor:
-    """Number of marked pixels within a square around each pixel, from a summed-area table ``(H + 1, W + 1)``."""
+    """Number of pixels that are set within a square around each pixel, from a summed-area table ``(H + 1, W + 1)``."""
     height, width = total.shape[0] - 1, total.shape[1] - 1
     top = (row - radius).floor().long().clamp(0, height)
     bottom = ((row + radius).floor().long() + 1).clamp(0, height)

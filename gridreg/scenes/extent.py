@@ -114,7 +114,7 @@ def points_extent(poses: NDArray[np.float64], points: NDArray[np.float64]) -> Ex
         InputError: when no camera has a point before it.
     """
     low, high = np.quantile(points, [0.005, 0.995], axis=0)
-    # The same on every side: thin and plain parts that points miss may stick out of any of them.
+    # The same on every side: slender and plain parts that points miss may stick out of any of them.
     apart = np.linalg.norm(poses[:, :3, 3] - points.mean(axis=0), axis=-1)
     margin = max(0.2 * float((high - low).max()), 0.01 * float(apart.max()))
     bounds = np.stack([low - margin, high + margin])

@@ -88,7 +88,7 @@ def load_scene(
     elif test is None and protocol.validates:
         scored, test_ids = files.train, _free_ids(VALIDATION_VIEWS, train_ids, files, by)
     elif test is None and files.split_here:
-        # The held-out frames are the test views; a protocol's rule would thin them out a second time.
+        # The held-out frames are the test views; a protocol's rule would choose among them a second time.
         test_ids = tuple(range(len(files.test)))
     elif test is None:
         test_ids = _checked(_selected(protocol.test, files.test), files, "test", by)

@@ -196,10 +196,10 @@ def _draw_series(axes: Axes, name: str, rows: Sequence[Row]) -> None:
     if width < 2:
         axes.plot(steps, values, marker="o" if len(values) < 30 else "", markersize=3, label=_verbatim(name))
         return
-    (thin,) = axes.plot(steps, values, linewidth=0.6, alpha=0.35)
+    (raw,) = axes.plot(steps, values, linewidth=0.6, alpha=0.35)
     smooth = np.convolve(values, np.full(width, 1 / width), mode="valid")
     middle = np.convolve(steps, np.full(width, 1 / width), mode="valid")
-    axes.plot(middle, smooth, linewidth=1.6, color=thin.get_color(), label=_verbatim(name))
+    axes.plot(middle, smooth, linewidth=1.6, color=raw.get_color(), label=_verbatim(name))
 
 
 def _verbatim(text: str) -> str:

@@ -190,7 +190,7 @@ def _fill(
     step: float32, bits: Matrix[int64], offsets: Vector[int64], index: Vector[int64], t: Vector[float32],
     x: Matrix[float32],
 ) -> None:  # fmt: skip
-    """Write out the marked samples of blocks of rays."""
+    """Write out the samples whose bits are set, of blocks of rays."""
     for ray in range(task * _RAYS, min((task + 1) * _RAYS, o.shape[0])):
         i = int64(-1)
         for n in range(offsets[ray], offsets[ray + 1]):

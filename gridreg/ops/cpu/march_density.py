@@ -172,7 +172,7 @@ def _write(
 
 
 def march_density(
-    marked: MarchBits,
+    candidates: MarchBits,
     planes: Sequence[Tensor],
     lines: Sequence[Tensor],
     *,
@@ -184,7 +184,7 @@ def march_density(
     """Density at the samples of a march up to where a ray is opaque, not differentiable.
 
     Args:
-        marked: the samples, as `gridreg.ops.cpu.march.mark` returns them.
+        candidates: the samples, as `gridreg.ops.cpu.march.mark` returns them.
         planes: three, or none for a CP grid.
         lines: three.
         read: number of channels to use.
@@ -195,19 +195,19 @@ def march_density(
     Returns:
         The samples that can be seen, and their positions normalised to the box ``(N, 3)``.
     """
-    rays, samples = len(marked.offsets) - 1, int(marked.offsets[-1])
+    rays, samples = len(candidates.offsets) - 1, int(candidates.offsets[-1])
     tasks, box = -(-rays // _RAYS) if samples else 0, activation.bounds.contiguous()
     density, counts = torch.empty(samples), torch.zeros(rays, dtype=torch.int64)
     limit = -math.log(transmittance_bound) if transmittance_bound > 0 else math.inf
     launch(
-        _march_vm if planes else _march_cp, tasks, *marked, *planes, *lines, read, box, float(activation.shift),
+        _march_vm if planes else _march_cp, tasks, *candidates, *planes, *lines, read, box, float(activation.shift),
         float(activation.scale), float(step), limit, density, counts,
     )  # fmt: skip
-    offsets = torch.zeros_like(marked.offsets)
+    offsets = torch.zeros_like(candidates.offsets)
     torch.cumsum(counts, 0, out=offsets[1:])
     count = int(offsets[-1])
     index, t, positions = torch.empty(count, dtype=torch.int64), torch.empty(count), torch.empty(count, 3)
     kept, u = torch.empty(count), torch.empty(count, 3)
     found = (offsets, index, t, positions, kept)
-    launch(_write, tasks if count else 0, *marked, density, box, float(step), *found, u)
+    launch(_write, tasks if count else 0, *candidates, density, box, float(step), *found, u)
     return RayMarchResult(*found), u

@@ -1,6 +1,6 @@
 """The object of the built-in scene: a lighthouse on a floating island, as a union of convex solids.
 
-It has what few-view reconstruction finds hard: thin parts (railing, fence, flagpole, spire), fine
+It has what few-view reconstruction finds hard: slender parts (railing, fence, flagpole, spire), fine
 texture (bricks, tiles, spiral bands), parts that hide each other, and glossy ones (lantern, buoy)
 whose look changes with the view.
 """
@@ -183,7 +183,7 @@ def _small_things() -> Iterator[Part]:
     # A glossy buoy with a band.
     yield _at(Ball(0.14), (0.30, 0.52, -0.38), Material(plain((0.90, 0.35, 0.08)), gloss=0.9, sharpness=60))
     yield _at(Frustum(0.143, 0.143, 0.05), (0.30, 0.52, -0.405), Material(plain(_WHITE), gloss=0.5))
-    # A flag of three stripes on a thin pole.
+    # A flag of three stripes on a slender pole.
     pole = np.array([-0.66, 0.36, -0.51])
     yield _rod(pole, _up(pole, 0.75), 0.010, _TIMBER)
     yield _at(Ball(0.02), _up(pole, 0.76), Material(plain((0.85, 0.66, 0.25)), gloss=0.8))

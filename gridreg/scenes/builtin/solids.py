@@ -202,7 +202,7 @@ class Frustum:
         a = _away_from_zero(x * x + y * y - slope**2 * z * z)
         b = origin[0] * x + origin[1] * y - ring * slope * z
         inside_root = b * b - a * (origin[0] ** 2 + origin[1] ** 2 - ring**2)
-        # A line through the body meets its endless cone, and few lines of a window around a thin rod do.
+        # A line through the body meets its endless cone, and few lines of a window around a narrow rod do.
         meets = np.nonzero(inside_root >= 0)
         a, b, x, y, z = a[meets], b[meets], x[meets], y[meets], z[meets]
         root = np.sqrt(inside_root[meets])

@@ -11,7 +11,7 @@ A kernel is a function of a task's number and of typed arguments::
 serve tasks until there are none. A last argument annotated `Table` is that table itself, for a kernel whose number of
 arguments varies; it reads further arguments by their position, with `vector` and its like.
 
-Kernels are compiled on their first use and cached on disk. Functions that they call are marked with `inline`. What
+Kernels are compiled on their first use and cached on disk. Functions that they call are decorated with `inline`. What
 reads the table is written into the kernel's own source, and generated: each function that numba has to compile costs
 the first run some hundredths of a second, and a slice or a new array in a kernel costs several.
 """
