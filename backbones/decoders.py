@@ -16,8 +16,6 @@ from gridreg.attach.sites import Site, inputs, parameters
 from gridreg.encodings import octaves_of_channels
 from gridreg.ops.perceptron import Precision
 
-__all__ = ["DECODERS", "Basis", "MLPDecoder", "RGBDecoder", "SHDecoder", "make_decoder"]
-
 
 class Basis(nn.Linear):
     """The linear map from components to features (TensoRF's matrix ``B``), without bias.

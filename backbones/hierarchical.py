@@ -5,8 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-__all__ = ["intervals", "inverse_transform", "stratified"]
-
 
 def stratified(t_min: Tensor, t_max: Tensor, count: int, jitter: Tensor) -> tuple[Tensor, Tensor]:
     """One sample in each of ``count`` equal parts of every ray.

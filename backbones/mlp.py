@@ -20,8 +20,6 @@ from gridreg.ops.perceptron import Precision
 if TYPE_CHECKING:
     from gridreg.rendering import OccupancyGrid, Rays
 
-__all__ = ["MLPField"]
-
 # Positions at once where no gradient is wanted: some tens of megabytes of hidden units.
 _CHUNK = 1 << 15
 

@@ -19,8 +19,6 @@ from gridreg.ops.fused_adam import FusedAdam
 if TYPE_CHECKING:
     from gridreg.rendering import OccupancyGrid, Rays
 
-__all__ = ["TensorialField", "density_shift_for"]
-
 
 def density_shift_for(opacity: float, length: float, distance_scale: float) -> float:
     """The shift at which a ray through an untrained field has a wanted opacity.

@@ -14,8 +14,6 @@ from gridreg.attach._hooks import open_channels
 from gridreg.attach.sites import Site, parameters
 from gridreg.ops.interpolation import LINE_AXES, PLANE_AXES
 
-__all__ = ["VMField"]
-
 
 class VMField(TensorialField):
     """A radiance field factored into three plane-line pairs.

@@ -30,10 +30,10 @@ from gridreg.errors import InputError
 from gridreg.rendering import Camera, Lens
 from gridreg.scenes import Scene, load_scene
 from gridreg.training import LoadedRun, load_run
-from gridreg.training.config import to_data
 from gridreg.training.evaluate import score_views
 from gridreg.training.loading import ensemble_of
 from gridreg.training.record import metrics_record
+from gridreg.training.typed_data import to_data
 from gridreg.training.versions import versions
 
 STUDY, DEVIATIONS = "ensembles", "deviations"

@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 from gridreg.export import Camera, Mesh
 from gridreg.training.images import ImageArray
 
-__all__ = ["mesh_image"]
-
 
 def mesh_image(mesh: Mesh, camera: Camera, *, colours: bool, points: int = 3_000_000) -> ImageArray:
     """The image ``(H, W, 3)`` of a mesh on white, lit from the camera's upper left.

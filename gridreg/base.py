@@ -9,24 +9,12 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar
 import torch
 from torch import Tensor
 
-from gridreg.attach.sites import NOT_NEGATIVE, Grid, Place, SiteLike, check_site, choices_of, within
+from gridreg.attach.sites import Grid, Place, SiteLike, check_site, choices_of
 from gridreg.errors import InputError
 from gridreg.schedules import Numeric, check_numeric, end_step, resolve
 
 if TYPE_CHECKING:
     from gridreg.samples import RaySamples
-
-__all__ = [
-    "NOT_NEGATIVE",
-    "REGISTRY",
-    "Clock",
-    "Context",
-    "LocalTerm",
-    "Regularizer",
-    "overrides",
-    "register",
-    "within",
-]
 
 
 class Clock:

@@ -9,8 +9,6 @@ from torch import Tensor, nn
 
 from gridreg.errors import InputError
 
-__all__ = ["Order", "PositionalEncoding", "octaves_of_channels", "positional_encoding"]
-
 Order: TypeAlias = Literal["octave", "sines_first", "coordinate"]
 """Order of the channels: see `positional_encoding`."""
 

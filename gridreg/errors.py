@@ -8,17 +8,6 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-__all__ = [
-    "RENAMED",
-    "RENAMED_KEYS",
-    "ConfigError",
-    "InputError",
-    "KeyPath",
-    "near_names",
-    "one_line",
-    "silenced",
-]
-
 RENAMED = {
     "Distortion": "DistortionLoss",
     "SpaceAnnealing": "SampleSpaceAnnealing",

@@ -15,8 +15,6 @@ from torch import nn
 
 from gridreg.errors import ConfigError, InputError, near_names
 
-__all__ = ["field_names", "import_modules", "make_field", "register_field"]
-
 _registered: dict[str, Callable[..., nn.Module]] = {}
 
 

@@ -15,16 +15,6 @@ import torch
 
 from gridreg.errors import InputError
 
-__all__ = [
-    "DeviceName",
-    "available_memory",
-    "check_memory",
-    "choose_device",
-    "remove_left_behind",
-    "temporary_beside",
-    "usable_cores",
-]
-
 DeviceName = Literal["cpu", "cuda", "mps", "auto"]
 
 _CGROUP = (

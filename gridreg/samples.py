@@ -20,8 +20,6 @@ from gridreg.segments import (
     sum_per_ray,
 )
 
-__all__ = ["RaySamples"]
-
 # Programs close a ray with an interval of 1e10, so that it ends opaque: no length of anything in the scene.
 _ENDLESS = 1e9
 

@@ -14,22 +14,6 @@ from typing import Any, TypeAlias, TypeVar
 
 from gridreg.errors import InputError
 
-__all__ = [
-    "SCHEDULES",
-    "Cosine",
-    "Geometric",
-    "Linear",
-    "Numeric",
-    "Piecewise",
-    "Schedule",
-    "check_numeric",
-    "check_until",
-    "end_step",
-    "fixed_end",
-    "register_schedule",
-    "resolve",
-]
-
 
 @dataclass(frozen=True)
 class Schedule:

@@ -10,8 +10,6 @@ from torch import Tensor
 
 from gridreg.errors import InputError
 
-__all__ = ["before_less_behind", "optical_depth_to_weights", "spread", "sum_before", "sum_per_ray"]
-
 _PER_SAMPLE = ("t", "delta", "index", "density", "weights")
 _PER_SAMPLE_3 = ("positions", "colours", "gradients")
 _PER_RAY_3 = ("directions", "background")

@@ -341,7 +341,7 @@ def test_killed_and_gone_on_with(tmp_path, cache, expected):
 def test_expected_numbers_are_those_of_training(expected, cache, tmp_path):
     """The room adds nothing to what a run computes."""
     from gridreg.training import RunConfig
-    from gridreg.training.config import from_data
+    from gridreg.training.typed_data import from_data
 
     spec = tiny_study(seeds="[0, 1]").runs[3]
     scene = Scenes(cache).get(spec)

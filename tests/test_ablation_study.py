@@ -14,7 +14,7 @@ from gridreg.ablation.study import load_study, study_from_text
 from gridreg.errors import InputError
 from gridreg.scenes import get_protocol
 from gridreg.training import RunConfig, load_preset
-from gridreg.training.config import from_data
+from gridreg.training.typed_data import from_data
 from tests.ablation_runs import tiny_study, write_study
 
 

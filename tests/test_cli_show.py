@@ -11,8 +11,8 @@ from gridreg.cli import main
 from gridreg.fields import field_names
 from gridreg.scenes.protocols import COUNTED, PROTOCOLS, get_protocol
 from gridreg.training import RunConfig, preset_names
-from gridreg.training.config import from_data
 from gridreg.training.presets import load_preset, preset_text
+from gridreg.training.typed_data import from_data
 from tests.inventory import inventory
 
 KNOWN = {

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import importlib
+import inspect
 import io
 import re
 import shlex
@@ -27,7 +29,7 @@ from gridreg.compositions import named as compositions
 from gridreg.scenes.protocols import PROTOCOLS, Listed
 from gridreg.schedules import SCHEDULES
 from gridreg.training import RunConfig, TrainOptions, preset_names
-from gridreg.training.config import from_data
+from gridreg.training.typed_data import from_data
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
@@ -222,12 +224,12 @@ ROOMS = (
 
 
 def documented(directive: str) -> Iterator[object]:
-    """What a line `::: name` of the reference shows: an object, or what a module exports or defines."""
+    """What a line `::: name` of the reference shows: an object, or what a module defines."""
     with contextlib.suppress(ModuleNotFoundError):
         module = importlib.import_module(directive)
-        for name, value in vars(module).items():
-            if name in module.__all__ or getattr(value, "__module__", None) == directive:
-                yield value
+        imports = (n for n in ast.parse(inspect.getsource(module)).body if isinstance(n, ast.ImportFrom))
+        imported = {alias.asname or alias.name for line in imports for alias in line.names}
+        yield from (value for name, value in vars(module).items() if name not in imported)
         return
     module_name, _, name = directive.rpartition(".")
     yield getattr(importlib.import_module(module_name), name)

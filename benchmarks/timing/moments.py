@@ -11,8 +11,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-__all__ = ["Moments"]
-
 # What changes files, and which argument says which.
 _SAVES = [
     ("os", "rename", 1),

@@ -26,16 +26,6 @@ from gridreg.errors import InputError
 from gridreg.training.checkpoint import has_checkpoint, load_checkpoint
 from timing.moments import Moments
 
-__all__ = [
-    "Trial",
-    "end_of_run",
-    "end_of_study",
-    "in_child",
-    "small_disk",
-    "small_drawings",
-    "what_stands",
-]
-
 # What a run imports late is imported here once, not in each of the forked processes.
 Image.init()
 

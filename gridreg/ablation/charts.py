@@ -11,8 +11,6 @@ from gridreg.ablation.comparison import Row, Section, figure_of
 from gridreg.ablation.records import RunResult
 from gridreg.export.line_chart import DASHES, HUES, Series, line_chart
 
-__all__ = ["Histories", "curves", "over_views", "styles"]
-
 Histories = Callable[[RunResult], Sequence[Mapping[str, object]]]
 """Gives the rows of a run's history."""
 

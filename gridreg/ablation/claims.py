@@ -12,14 +12,6 @@ from pathlib import Path
 from gridreg.ablation.records import RunSpec
 from gridreg.errors import InputError
 
-__all__ = [
-    "HEARTBEAT_SECONDS",
-    "LEASE_SECONDS",
-    "Claim",
-    "ClaimLostError",
-    "heartbeat",
-]
-
 HEARTBEAT_SECONDS = 10.0
 """Between two signs of life of a worker."""
 

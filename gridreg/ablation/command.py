@@ -18,8 +18,6 @@ from gridreg.ablation.study import load_study
 from gridreg.errors import InputError, near_names
 from gridreg.machine import DeviceName, choose_device, usable_cores
 
-__all__ = ["AblationOptions", "make_runner", "run"]
-
 
 @dataclass
 class AblationOptions:

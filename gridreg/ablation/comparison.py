@@ -15,8 +15,6 @@ from gridreg.ablation.records import RunResult, RunSpec, Study
 from gridreg.ablation.statistics import Cell, Difference, Estimate, estimate, holm, paired_differences
 from gridreg.errors import InputError
 
-__all__ = ["LEVEL", "Row", "Section", "Setting", "cell_of", "compare", "figure_of"]
-
 LEVEL = 0.05
 """Chance of a false finding that intervals (95 %) and tests allow."""
 

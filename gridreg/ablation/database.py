@@ -15,8 +15,6 @@ from pathlib import Path
 
 from gridreg.errors import InputError
 
-__all__ = ["APPLICATION_ID", "SCHEMA_VERSION", "Database", "DiskFullError"]
-
 SCHEMA_VERSION = 1
 """Raised by one whenever an older gridreg could not read what is written."""
 

@@ -14,19 +14,6 @@ from gridreg.errors import ConfigError, InputError, near_names
 from gridreg.training.presets import load_preset, preset_names
 from gridreg.training.typed_data import from_data
 
-__all__ = [
-    "Plain",
-    "added",
-    "change_argument",
-    "known_composition",
-    "matches",
-    "normalised",
-    "parts_of",
-    "removed",
-    "replaced",
-    "title_of",
-]
-
 Plain = list[dict[str, Any]]
 """A composition as `gridreg.to_config` writes it."""
 

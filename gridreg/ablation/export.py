@@ -12,8 +12,6 @@ from gridreg.ablation.records import RunResult
 from gridreg.errors import InputError
 from gridreg.training.files import write_text, writing
 
-__all__ = ["export_results", "table_rows"]
-
 
 def table_rows(results: Sequence[RunResult]) -> list[dict[str, Any]]:
     """One flat row a run: what determines it, its mean scores, seconds by phase, and where it was computed.

@@ -10,8 +10,6 @@ from matplotlib.ticker import MaxNLocator
 
 from gridreg.ablation.comparison import Row, Section
 
-__all__ = ["Forest", "forest_plot", "heat_map"]
-
 
 @dataclass(frozen=True)
 class Forest:

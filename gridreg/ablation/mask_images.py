@@ -14,8 +14,6 @@ from gridreg.ablation.records import RunResult
 from gridreg.export.html import data_uri
 from gridreg.training.images import coloured
 
-__all__ = ["colour_scale", "mask_schedules"]
-
 
 def mask_schedules(runs: Sequence[RunResult], histories: Histories) -> list[dict[str, Any]]:
     """The masks over the iterations; compositions with equal masks stand together.

@@ -16,11 +16,10 @@ from typing import Any
 from gridreg.ablation.records import RunSpec
 from gridreg.errors import ConfigError, InputError
 from gridreg.training import RunConfig
-from gridreg.training.config import from_data, save_yaml
+from gridreg.training.config import save_yaml
 from gridreg.training.files import check_output_folder, output_errors
 from gridreg.training.progress import interruptible
-
-__all__ = ["VALUES", "run_command", "words_of"]
+from gridreg.training.typed_data import from_data
 
 VALUES = ("label", "scene", "protocol", "views", "seed", "steps", "out", "config")
 """What a command may ask for, each in braces: ``{config}`` is a YAML file with the run's configuration, its composition

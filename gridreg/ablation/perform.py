@@ -24,19 +24,9 @@ from gridreg.errors import InputError
 from gridreg.scenes import Scene, builtin_scene, load_scene
 from gridreg.training import RunConfig, execute
 from gridreg.training.checkpoint import has_checkpoint, load_checkpoint
-from gridreg.training.config import from_data
 from gridreg.training.files import check_output_folder, output_errors, remove_folder
+from gridreg.training.typed_data import from_data
 from gridreg.training.versions import cpu_model
-
-__all__ = [
-    "LOG_NAME",
-    "Scenes",
-    "TaskResult",
-    "describe_machine",
-    "is_disk_full",
-    "perform",
-    "scene_key",
-]
 
 LOG_NAME = "log.txt"
 """File in a run's folder with what the run printed, and the traceback of an error."""

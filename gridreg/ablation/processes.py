@@ -20,8 +20,6 @@ from gridreg.machine import usable_cores
 from gridreg.training.files import output_errors
 from gridreg.training.progress import interruptible
 
-__all__ = ["LOG_NAME", "Processes"]
-
 LOG_NAME = "workers.log"
 """File in the store with what worker processes print outside of runs."""
 

@@ -12,8 +12,6 @@ from gridreg.ablation.records import RunResult, RunSpec
 from gridreg.ablation.runners import Event
 from gridreg.training.progress import clock_time
 
-__all__ = ["StudyProgress", "dry_run_lines", "left_in_words", "seconds_left"]
-
 
 def seconds_left(results: Sequence[RunResult]) -> float | None:
     """Estimate the time of the runs that are left, one after another; None if no run is finished yet.

@@ -10,8 +10,6 @@ from typing import Any
 from gridreg.ablation.edits import Plain, normalised
 from gridreg.ablation.statistics import standard_error
 
-__all__ = ["ADDITIONS", "FACTORS", "FEWEST", "START", "Gain", "Outcome", "candidates", "chosen", "race"]
-
 FACTORS = (0.25, 4.0)
 """What every weight of the composition is multiplied by, one regularizer at a time."""
 

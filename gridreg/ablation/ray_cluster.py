@@ -14,8 +14,6 @@ from typing import Any
 
 from gridreg.errors import InputError
 
-__all__ = ["ANSWER_SECONDS", "check_answers", "connected", "import_ray"]
-
 ANSWER_SECONDS = 20.0
 """Time that an address may take to answer."""
 

@@ -19,8 +19,6 @@ from gridreg.errors import InputError
 from gridreg.machine import usable_cores
 from gridreg.training.progress import Interruption, interruptible
 
-__all__ = ["RayRunner"]
-
 _POLL = 0.5
 _SAVING_SECONDS = 60.0
 

@@ -21,8 +21,6 @@ from gridreg.machine import remove_left_behind, temporary_beside
 from gridreg.scenes import Scene
 from gridreg.training.files import output_errors, remove_folder
 
-__all__ = ["Task", "read_folder", "run_task", "write_folder"]
-
 
 @dataclass(frozen=True)
 class Task:

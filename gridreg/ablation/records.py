@@ -10,8 +10,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
-__all__ = ["NUMERICS_VERSION", "STATUSES", "RunResult", "RunSpec", "Status", "Study"]
-
 NUMERICS_VERSION = 4
 """Raised by one whenever the same configuration gives other numbers, so that stored results are not mixed."""
 

@@ -32,8 +32,6 @@ from gridreg.errors import InputError
 from gridreg.scenes.protocols import get_protocol
 from gridreg.training.files import write_bytes
 
-__all__ = ["IMAGE_BYTES", "HasResults", "findings", "provenance", "write_report"]
-
 IMAGE_BYTES = 6_000_000
 """Default bound on what images add to the page."""
 

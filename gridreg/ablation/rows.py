@@ -39,8 +39,6 @@ from gridreg.errors import ConfigError
 from gridreg.training.strict_yaml import Document
 from gridreg.training.typed_data import from_data
 
-__all__ = ["KEYS", "StudyRow", "expand_rows"]
-
 KEYS: dict[str, tuple[str, ...]] = {
     "name": ("remove", "replace", "add"),
     "regularizers": (),

@@ -19,8 +19,6 @@ from gridreg.ablation.workers import Worker
 from gridreg.errors import InputError
 from gridreg.training.files import remove_folder
 
-__all__ = ["PAUSED", "Event", "InProcess", "Kind", "Report", "Runner", "settle"]
-
 Kind = Literal["started", "done", "failed", "interrupted", "lost"]
 
 PAUSED = "the study is paused, and the same command goes on from here when there is space"

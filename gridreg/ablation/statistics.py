@@ -16,17 +16,6 @@ from scipy.special import stdtr, stdtrit  # type: ignore[import-untyped]
 
 from gridreg.errors import InputError
 
-__all__ = [
-    "Cell",
-    "Difference",
-    "Estimate",
-    "Verdict",
-    "estimate",
-    "holm",
-    "paired_differences",
-    "standard_error",
-]
-
 Verdict = Literal["higher", "lower", "within noise", "one pair", "no pair"]
 
 

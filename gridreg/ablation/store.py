@@ -29,8 +29,6 @@ from gridreg.ablation.workers import Worker
 from gridreg.errors import InputError
 from gridreg.training.files import check_output_folder, write_json
 
-__all__ = ["MOST_LOSSES", "RESULT_NAME", "Attempt", "Store"]
-
 Attempt = dict[str, Any]
 
 MOST_LOSSES = 3

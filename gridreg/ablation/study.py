@@ -38,14 +38,13 @@ from gridreg.errors import ConfigError
 from gridreg.fields import field_names, import_modules, make_field
 from gridreg.scenes.files import read_text
 from gridreg.scenes.protocols import Every, Listed, Protocol, get_protocol
-from gridreg.training.config import from_data, override, to_data
+from gridreg.training.config import override
 from gridreg.training.options import TrainOptions, configure
 from gridreg.training.presets import load_preset
 from gridreg.training.run import regularizers_of
 from gridreg.training.settings import RunConfig
 from gridreg.training.strict_yaml import parse_yaml
-
-__all__ = ["BUILTIN_FRAMES", "DATA_VARIABLE", "check_fits", "load_study", "run_of", "study_from_text"]
+from gridreg.training.typed_data import from_data, to_data
 
 DATA_VARIABLE = "GRIDREG_DATA"
 BUILTIN_FRAMES = 18

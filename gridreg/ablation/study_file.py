@@ -9,8 +9,6 @@ from typing import Any
 
 from gridreg.errors import ConfigError
 
-__all__ = ["StudyFile"]
-
 
 @dataclass(frozen=True)
 class StudyFile:

@@ -18,8 +18,6 @@ from gridreg.ablation.report import write_report
 from gridreg.errors import InputError, near_names
 from gridreg.scenes.files import read_text
 
-__all__ = ["ReportOptions", "TableResults", "read_table", "run"]
-
 # Of a row: all that is no metric. What a store exports can be read back.
 _TEXTS = ("label", "scene", "protocol", "preset", "backbone", "status", "machine", "reason")
 _OTHERS = ("seed", "views", "steps", "seconds", "threads", "gridreg", "torch", "hash")

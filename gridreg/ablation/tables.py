@@ -12,21 +12,6 @@ from gridreg.ablation.comparison import Row, Section
 from gridreg.ablation.statistics import Estimate
 from gridreg.ablation.templates import render
 
-__all__ = [
-    "LEGEND",
-    "MINUS",
-    "SIGNS",
-    "columns_of",
-    "difference_text",
-    "duration",
-    "further_metrics",
-    "latex",
-    "markdown",
-    "mean_text",
-    "notes_of",
-    "signed",
-]
-
 MINUS = "\N{MINUS SIGN}"
 
 SIGNS = {

@@ -35,8 +35,6 @@ from gridreg.training.options import TrainOptions, configure
 from gridreg.training.run import regularizers_of
 from gridreg.training.settings import RunConfig
 
-__all__ = ["TuneOptions", "run"]
-
 
 @dataclass
 class TuneOptions:

@@ -10,8 +10,6 @@ from gridreg.ablation.comparison import Section
 from gridreg.ablation.records import RunResult
 from gridreg.export.html import encode, open_image, spread_views, target_beside
 
-__all__ = ["VIEWS_PER_SCENE", "first_choice", "wipe_data"]
-
 VIEWS_PER_SCENE = 4
 
 

@@ -15,8 +15,6 @@ import sys
 import threading
 from collections.abc import Sequence
 
-__all__ = ["EXIT_DISK_FULL", "main"]
-
 EXIT_DISK_FULL = 3
 
 

@@ -10,8 +10,6 @@ from pathlib import Path
 
 from gridreg.training.typed_data import from_data
 
-__all__ = ["Worker"]
-
 
 @dataclass(frozen=True)
 class Worker:

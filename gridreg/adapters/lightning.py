@@ -11,8 +11,6 @@ import gridreg
 from gridreg.base import Regularizer
 from gridreg.errors import InputError
 
-__all__ = ["Regularization"]
-
 
 class Regularization(Callback):  # type: ignore[misc]
     """Sets the step before each batch, adds the penalties to the loss, logs them, and is part of the checkpoint.

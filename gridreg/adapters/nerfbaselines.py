@@ -30,8 +30,6 @@ from gridreg.training import TrainOptions, configure, load_run
 from gridreg.training.files import check_output_folder, write_bytes
 from gridreg.training.run import build_trainer, resume_trainer, save_run
 
-__all__ = ["GridregMethod", "download_few_views", "load_few_views"]
-
 PRESET = "best"
 # nerfbaselines' cameras look along +z with y down (OpenCV), ours along -z with y up.
 _FLIP = np.array([1.0, -1.0, -1.0, 1.0])

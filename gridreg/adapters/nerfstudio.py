@@ -32,8 +32,6 @@ import gridreg
 from gridreg.attach.selectors import Selector
 from gridreg.encodings import octaves_of_channels
 
-__all__ = ["GridregTensoRF", "GridregTensoRFConfig", "gridreg_tensorf", "ray_samples"]
-
 
 def ray_samples(samples: Any, density: Tensor, directions: Tensor | None = None) -> gridreg.RaySamples:
     """nerfstudio's `RaySamples` of shape `(R, S)` with their densities `(R, S, 1)`, as penalties read them.

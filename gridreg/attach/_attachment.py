@@ -25,8 +25,6 @@ from gridreg.attach.sites import SiteLike
 from gridreg.base import Clock, Context, Regularizer
 from gridreg.errors import InputError
 
-__all__ = ["Attachment"]
-
 Key = tuple[str, str, str]
 
 _NUMBERS = count()

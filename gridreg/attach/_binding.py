@@ -12,8 +12,6 @@ from gridreg.attach.sites import Grid, Selector, SiteLike
 from gridreg.base import Clock, Context, Regularizer, overrides
 from gridreg.errors import InputError
 
-__all__ = ["READS_GRIDS", "Binding", "bindings_of", "site_label"]
-
 READS_GRIDS = (
     Regularizer.grid_penalty,
     Regularizer.local_terms,

@@ -25,8 +25,6 @@ from gridreg.attach._instance_class import STACKS, set_instance_class
 from gridreg.attach._slots import MADE, Slot, Stack, masked_parameter
 from gridreg.errors import InputError
 
-__all__ = ["attach", "detach", "open_channels", "slots_of", "strip"]
-
 
 class Hook:
     """Base of both hooks: a slot, and which tensor of several passes through it."""

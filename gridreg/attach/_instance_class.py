@@ -11,8 +11,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils import parametrize, prune
 
-__all__ = ["STACKS", "set_instance_class"]
-
 STACKS = "_gridreg_stacks"
 """Entry of a module's `__dict__`: for each tensor, the stack of slots that acts on it."""
 

@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from gridreg.attach._attachment import Attachment
     from gridreg.attach._slots import Slot
 
-__all__ = ["SuspendingMethod", "resume", "wrap"]
-
 
 class SuspendingMethod:
     """Stands in an object's `__dict__` in front of the method of its class."""

@@ -18,8 +18,6 @@ from gridreg.errors import InputError
 if TYPE_CHECKING:
     from gridreg.samples import RaySamples
 
-__all__ = ["HandleParts"]
-
 
 class HandleParts:
     """Base of `Handle`: each method does nothing unless a regularizer overrides its counterpart.

@@ -15,8 +15,6 @@ from torch.nn.parameter import is_lazy
 from gridreg.attach.sites import Grid, Place, Selector, Site, SiteLike, spatial_axes
 from gridreg.errors import InputError, near_names
 
-__all__ = ["Match", "Part", "find", "raw_tensor", "register_adapter", "sites_of"]
-
 # DistributedDataParallel and DataParallel, and torch.compile.
 _WRAPPERS = re.compile(r"^((module|_orig_mod)\.)+")
 

@@ -12,8 +12,6 @@ from torch import Tensor, nn
 from gridreg.base import Context, Regularizer
 from gridreg.errors import InputError
 
-__all__ = ["COPIES", "MADE", "Slot", "Stack", "masked_parameter"]
-
 _MASKED = "_gridreg_parameter"
 """Attribute of a masked tensor: the parameter that it was made of."""
 

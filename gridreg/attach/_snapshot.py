@@ -12,8 +12,6 @@ from torch import Tensor, nn
 from gridreg.attach._binding import Binding
 from gridreg.attach._slots import Slot
 
-__all__ = ["MaskedTensor", "Snapshot"]
-
 
 class MaskedTensor(NamedTuple):
     """A parameter or buffer that a slot transforms."""

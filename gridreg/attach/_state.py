@@ -12,8 +12,6 @@ from gridreg.attach._resolve import raw_tensor
 from gridreg.attach._slots import Slot
 from gridreg.errors import InputError
 
-__all__ = ["bake", "load_state", "state_of"]
-
 Slots = Mapping[tuple[str, str, str], Slot]
 
 

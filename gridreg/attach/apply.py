@@ -13,8 +13,6 @@ from gridreg.attach.handle import Handle
 from gridreg.base import Clock, Regularizer
 from gridreg.errors import InputError
 
-__all__ = ["apply"]
-
 
 def apply(field: nn.Module, *regularizers: Regularizer, total_steps: int, seed: int = 0) -> Handle:
     """Attach regularizers to a field, which is neither edited nor copied.

@@ -19,8 +19,6 @@ from gridreg.base import Regularizer
 from gridreg.errors import InputError
 from gridreg.schedules import Schedule, drawing_axes
 
-__all__ = ["Handle"]
-
 
 class Handle(HandleParts):
     """Sets the step, gives the loss, and takes everything off again; returned by `apply`.

@@ -11,8 +11,6 @@ from torch import Tensor, nn
 
 from gridreg.errors import InputError
 
-__all__ = ["Kind", "Selector", "abridged", "inputs", "outputs", "parameters"]
-
 Kind: TypeAlias = Literal["parameters", "outputs", "inputs"]
 
 

@@ -13,16 +13,6 @@ import tyro
 
 from gridreg.errors import InputError
 
-__all__ = [
-    "Checkpoint",
-    "OptionalFile",
-    "OptionalFloat",
-    "OptionalFolder",
-    "OptionalInt",
-    "OptionalText",
-    "parse_options",
-]
-
 Checkpoint = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
 """Output folder of a run, or its checkpoint."""
 # The hint is left out because it could only say "None": the text of each option says what holds without it.

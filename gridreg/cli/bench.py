@@ -15,8 +15,6 @@ import tyro
 import gridreg
 from gridreg.errors import InputError
 
-__all__ = ["BenchOptions", "benchmarks", "run"]
-
 
 @dataclass
 class BenchOptions:

@@ -7,8 +7,6 @@ from pathlib import Path
 
 from gridreg.cli.arguments import OptionalFolder
 
-__all__ = ["BoardOptions", "run"]
-
 
 @dataclass
 class BoardOptions:

@@ -10,8 +10,6 @@ import tyro
 
 from gridreg.cli.arguments import OptionalFile, OptionalFloat
 
-__all__ = ["CompareMeshOptions", "run"]
-
 
 @dataclass
 class CompareMeshOptions:

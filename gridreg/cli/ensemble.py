@@ -10,8 +10,6 @@ import tyro
 
 from gridreg.cli.arguments import OptionalFolder
 
-__all__ = ["EnsembleOptions", "run"]
-
 
 @dataclass
 class EnsembleOptions:

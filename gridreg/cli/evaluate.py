@@ -13,8 +13,6 @@ from gridreg.machine import DeviceName, choose_device
 if TYPE_CHECKING:
     from gridreg.training import LoadedRun
 
-__all__ = ["EvalOptions", "run"]
-
 
 @dataclass
 class EvalOptions:
@@ -52,7 +50,6 @@ def _score(options: EvalOptions) -> int:
     from gridreg.export import write_page
     from gridreg.ops.compilation import work_clock
     from gridreg.training import load_run
-    from gridreg.training.config import to_data
     from gridreg.training.evaluate import Scored, score_views
     from gridreg.training.exposure import AFFINE_CONVENTION, affine_psnr
     from gridreg.training.files import check_output_folder
@@ -60,6 +57,7 @@ def _score(options: EvalOptions) -> int:
     from gridreg.training.outputs import save_contact_sheet, save_scored
     from gridreg.training.perceptual import read_lpips
     from gridreg.training.record import metrics_record, save_metrics, summary
+    from gridreg.training.typed_data import to_data
 
     lpips = None if options.lpips is None else read_lpips(options.lpips)
     loaded = load_run(options.checkpoint, choose_device(options.device))

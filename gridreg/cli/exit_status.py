@@ -10,8 +10,6 @@ from typing import Any, TextIO
 
 from gridreg.errors import InputError, one_line
 
-__all__ = ["run_cli"]
-
 _OF_TRAIN = {
     "PIL",
     "imageio",

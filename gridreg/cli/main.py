@@ -15,8 +15,6 @@ import gridreg
 from gridreg.cli.exit_status import run_cli
 from gridreg.errors import InputError, near_names
 
-__all__ = ["COMMANDS", "Command", "main", "options_of"]
-
 
 @dataclass(frozen=True)
 class Command:

@@ -10,8 +10,6 @@ import tyro
 from gridreg.cli.arguments import Checkpoint, OptionalFile, OptionalFloat, OptionalInt
 from gridreg.machine import DeviceName, choose_device
 
-__all__ = ["MeshOptions", "run"]
-
 
 @dataclass
 class MeshOptions:

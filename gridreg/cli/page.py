@@ -7,8 +7,6 @@ from dataclasses import dataclass
 
 from gridreg.cli.arguments import Checkpoint, OptionalFolder
 
-__all__ = ["PageOptions", "run"]
-
 
 @dataclass
 class PageOptions:

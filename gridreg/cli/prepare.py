@@ -10,8 +10,6 @@ import tyro
 
 from gridreg.cli.arguments import OptionalFile, OptionalFloat
 
-__all__ = ["PrepareOptions", "run"]
-
 Box = Annotated[
     tuple[float, float, float, float, float, float] | None,
     tyro.conf.arg(metavar="X0 Y0 Z0 X1 Y1 Z1", help_behavior_hint=""),

@@ -12,8 +12,6 @@ import tyro
 from gridreg.cli.arguments import OptionalInt
 from gridreg.machine import DeviceName
 
-__all__ = ["ReconstructOptions", "run"]
-
 
 @dataclass
 class ReconstructOptions:

@@ -12,8 +12,6 @@ import tyro
 from gridreg.cli.arguments import OptionalFile, OptionalFloat, OptionalFolder, OptionalInt, OptionalText
 from gridreg.machine import DeviceName, choose_device
 
-__all__ = ["RenderOptions", "run"]
-
 
 @dataclass
 class RenderOptions:

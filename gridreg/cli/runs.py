@@ -9,8 +9,6 @@ from gridreg.errors import InputError
 from gridreg.scenes import Scene, builtin_photographs
 from gridreg.training import LoadedRun, open_scene
 
-__all__ = ["folder_of", "photographs_of", "scene_of", "views_scene"]
-
 CACHE = Path("outputs")
 """Where the built-in scene is made, below the current folder."""
 

@@ -14,8 +14,6 @@ import tyro
 
 from gridreg.errors import InputError, near_names
 
-__all__ = ["ShowOptions", "run"]
-
 
 @dataclass
 class ShowOptions:

@@ -23,8 +23,6 @@ from gridreg.training import (
 from gridreg.training.record import summary
 from gridreg.training.tensorboard import TensorBoard
 
-__all__ = ["TrainOptions", "run"]
-
 
 def run(
     options: TrainOptions,

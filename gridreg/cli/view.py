@@ -16,8 +16,6 @@ from gridreg.machine import DeviceName, choose_device
 if TYPE_CHECKING:
     from gridreg.training import LoadedRun
 
-__all__ = ["ViewOptions", "run"]
-
 
 @dataclass
 class ViewOptions:

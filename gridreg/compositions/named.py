@@ -18,8 +18,6 @@ from gridreg.regularizers.optimizer import WeightDecay
 from gridreg.regularizers.total_variation import TotalVariation
 from gridreg.schedules import Linear, Piecewise
 
-__all__ = ["RETIRED", "composition", "composition_about", "composition_names", "register_composition"]
-
 RETIRED = {
     "few_tensorf_finetuned": "as published it is 'few_tensorf'; tuned here it is the preset of this name, "
     "in a study preset:few_tensorf_finetuned"

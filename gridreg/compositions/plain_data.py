@@ -13,8 +13,6 @@ from gridreg.base import REGISTRY, Regularizer
 from gridreg.errors import InputError, near_names
 from gridreg.schedules import SCHEDULES, Schedule
 
-__all__ = ["from_config", "to_config"]
-
 _SELECTORS: dict[str, Callable[..., Selector]] = {
     "parameters": parameters,
     "outputs": outputs,

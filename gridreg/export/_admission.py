@@ -18,8 +18,6 @@ from typing import Any
 from unittest import mock
 from urllib.parse import parse_qs, urlsplit
 
-__all__ = ["LOOPBACK", "Admission"]
-
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 MOST_CLIENTS = 16
 MOST_BYTES = 1 << 16

@@ -23,18 +23,6 @@ from gridreg.rendering.cameras import Camera, Lens
 from gridreg.scenes import Views
 from gridreg.training.images import to_uint8
 
-__all__ = [
-    "add_frustums",
-    "camera_of",
-    "check_address",
-    "fit_upright",
-    "go_to",
-    "image_shape",
-    "place_camera",
-    "quiet_console",
-    "start_server",
-]
-
 # The browser's cameras look along +z with y down (OpenCV).
 _FLIP = np.diag([1.0, -1.0, -1.0])
 _MOST_FRUSTUMS = 100

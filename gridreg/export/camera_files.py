@@ -16,8 +16,6 @@ from gridreg.scenes.files import read_json
 from gridreg.scenes.gate import check_cameras, check_pose
 from gridreg.training.files import write_json
 
-__all__ = ["load_cameras", "save_cameras"]
-
 _LENS_KEYS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
 
 

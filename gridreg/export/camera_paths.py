@@ -18,17 +18,6 @@ from gridreg.rendering.cameras import Camera, Lens
 from gridreg.scenes import IN_PLACE, Views, World
 from gridreg.scenes.extent import focus_point
 
-__all__ = [
-    "CAMERA_PATHS",
-    "camera_path",
-    "forward_facing",
-    "round_trip",
-    "spiral",
-    "sway",
-    "tour",
-    "turntable",
-]
-
 CAMERA_PATHS = ("turntable", "spiral", "train")
 """Names that `camera_path` knows; anything else is a camera file."""
 

@@ -14,8 +14,6 @@ from gridreg.errors import InputError
 from gridreg.scenes import Views
 from gridreg.scenes.extent import focus_point
 
-__all__ = ["Orbit", "look_at", "orbit_of_box", "orbit_of_views", "up_axis"]
-
 Vector = NDArray[np.float64]
 
 

@@ -14,8 +14,6 @@ from gridreg.errors import InputError
 from gridreg.export.mesh import Mesh
 from gridreg.machine import check_memory
 
-__all__ = ["MeshComparison", "compare_meshes", "sample_surface"]
-
 Points = NDArray[np.float64]
 
 # Triangles tried for each point: those of the nearest marks on the other surface.

@@ -12,8 +12,6 @@ from gridreg.errors import InputError
 from gridreg.scenes.files import read_json
 from gridreg.training.files import write_json
 
-__all__ = ["checked_crop", "load_crop", "save_crop"]
-
 Box = NDArray[np.float64]
 
 

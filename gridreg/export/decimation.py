@@ -13,8 +13,6 @@ from scipy.spatial import KDTree  # type: ignore[import-untyped]
 
 from gridreg.errors import InputError
 
-__all__ = ["check_faces", "decimate"]
-
 Vertices = NDArray[np.float64]
 Indices = NDArray[np.int64]
 

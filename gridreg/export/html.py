@@ -15,16 +15,6 @@ from PIL import Image
 from gridreg.errors import InputError
 from gridreg.scenes import decoding
 
-__all__ = [
-    "LONGEST_SIDE",
-    "data_uri",
-    "encode",
-    "open_image",
-    "page_environment",
-    "spread_views",
-    "target_beside",
-]
-
 LONGEST_SIDE = 400
 """Of an image in a page, pixels."""
 

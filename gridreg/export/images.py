@@ -20,8 +20,6 @@ from gridreg.training.images import (
     to_uint8,
 )
 
-__all__ = ["MODES", "DepthRange", "check_mode", "colour_bar", "depth_range", "to_image", "z_depth"]
-
 MODES = ("rgb", "depth", "opacity", "deviation")
 """Quantities of a render that an image can show."""
 

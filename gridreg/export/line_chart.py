@@ -16,8 +16,6 @@ from markupsafe import Markup, escape
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullLocator
 
-__all__ = ["DASHES", "HUES", "Series", "line_chart"]
-
 HUES, DASHES = 6, ("solid", (0, (4, 2)), (0, (1, 1.5)))
 """Colours beside the baseline's grey, and dashes."""
 

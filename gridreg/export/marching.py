@@ -12,8 +12,6 @@ from skimage.measure import marching_cubes
 
 from gridreg.export.volume import DensityVolume
 
-__all__ = ["drop_small_components", "polygonise", "vertex_normals"]
-
 Vertices = NDArray[np.float64]
 Faces = NDArray[np.int64]
 Density = Callable[[Vertices], NDArray[np.float32]]

@@ -18,8 +18,6 @@ from gridreg.machine import check_memory
 from gridreg.rendering import Field, OccupancyGrid
 from gridreg.segments import optical_depth_to_weights
 
-__all__ = ["Mesh", "extract_mesh", "seen_colours"]
-
 Colours = NDArray[np.uint8]
 
 

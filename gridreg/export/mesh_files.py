@@ -28,8 +28,6 @@ from gridreg.scenes import IN_PLACE, World
 from gridreg.scenes.files import read_bytes
 from gridreg.training.files import check_output_folder, write_bytes, writing
 
-__all__ = ["MESH_SUFFIXES", "read_mesh", "save_mesh", "write_mesh"]
-
 MESH_SUFFIXES = (".ply", ".obj", ".glb", ".stl")
 """Formats that `save_mesh` writes, by the suffix of the file's name."""
 

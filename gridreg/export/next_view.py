@@ -13,8 +13,6 @@ from gridreg.rendering.cameras import Camera, Lens
 from gridreg.rendering.model import Model
 from gridreg.scenes import Views
 
-__all__ = ["NextView", "next_view"]
-
 
 @dataclass(frozen=True)
 class NextView:

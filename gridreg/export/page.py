@@ -31,8 +31,6 @@ from gridreg.scenes import Scene
 from gridreg.training.curves import History
 from gridreg.training.files import write_bytes
 
-__all__ = ["write_page"]
-
 FACES = 60_000
 """Of the mesh in the page, at most: about a megabyte."""
 

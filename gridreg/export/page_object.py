@@ -20,8 +20,6 @@ from gridreg.scenes import Scene, Views, World
 from gridreg.scenes.files import read_json
 from gridreg.training.images import to_uint8
 
-__all__ = ["next_camera", "object_data", "small_photographs"]
-
 _PHOTOGRAPHS, _THUMBNAIL = 60, 160
 _UINT16 = 2**16 - 1
 

@@ -19,8 +19,6 @@ from gridreg.export.images import MODES
 from gridreg.rendering import OccupancyGrid
 from gridreg.rendering.model import Model
 
-__all__ = ["Preview"]
-
 
 class Preview:
     """Copies a model; what is set here never touches the original, and later training never touches the copy.

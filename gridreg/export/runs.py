@@ -25,14 +25,6 @@ from gridreg.scenes import Views
 if TYPE_CHECKING:
     from gridreg.training import Execution, StepReport
 
-__all__ = [
-    "LiveView",
-    "check_drawing",
-    "draw_run",
-    "video_path",
-    "live_view",
-]
-
 
 def video_path(
     model: Model, views: Views | None = None, path: str | Path | None = None, **options: Any

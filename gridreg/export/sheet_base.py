@@ -9,8 +9,6 @@ from gridreg.errors import InputError
 from gridreg.rendering import Field, OccupancyGrid
 from gridreg.scenes import World
 
-__all__ = ["OnSheet"]
-
 
 class OnSheet:
     """A field that goes on below a height as it is there, straight down to the sheet, and has nothing below that.

@@ -17,8 +17,6 @@ from gridreg.export.mesh import Mesh, seen_colours
 from gridreg.export.volume import SeenDensity
 from gridreg.rendering import Field, OccupancyGrid
 
-__all__ = ["check_texture", "textured"]
-
 Array = NDArray[np.float64]
 
 

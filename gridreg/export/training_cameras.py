@@ -15,8 +15,6 @@ from gridreg.rendering.model import Model
 from gridreg.scenes import Views
 from gridreg.training.images import ImageArray, row, to_uint8
 
-__all__ = ["TrainingCameras"]
-
 # Longer edge of what is compared, pixels.
 _EDGE = 400
 

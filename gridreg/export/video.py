@@ -17,8 +17,6 @@ from gridreg.rendering.cameras import Camera
 from gridreg.rendering.model import Model
 from gridreg.training.images import ImageArray, row
 
-__all__ = ["Progress", "render_frames", "render_video"]
-
 Progress = Callable[[int, int, float], None]
 """Told after every frame: frames done, frames in all, seconds left."""
 

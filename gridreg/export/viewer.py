@@ -31,8 +31,6 @@ from gridreg.rendering.cameras import Camera
 from gridreg.rendering.model import Model
 from gridreg.scenes import Views, World
 
-__all__ = ["Viewer"]
-
 # Seconds without movement after which the image is sharpened.
 _REST = 0.25
 # Of the window's height, or of its width if that is less.

@@ -13,8 +13,6 @@ from torch import Tensor
 from gridreg.export.crop_box import Box, save_crop
 from gridreg.scenes import World
 
-__all__ = ["CropControls"]
-
 
 class CropControls:
     """A box in the page, by its lower and upper corner, that cuts what is seen, and a button that saves it.

@@ -12,8 +12,6 @@ from gridreg.export.images import MODES
 from gridreg.export.preview import Preview
 from gridreg.training.images import ImageArray
 
-__all__ = ["Look", "Panel", "short_labels"]
-
 # Longer edge of an image, pixels.
 _SMALLEST, _LARGEST = 64, 1600
 # Characters that stay on one line of the panel.

@@ -10,8 +10,6 @@ from gridreg.export.viewer_panel import Look
 from gridreg.rendering import Rendered
 from gridreg.training.images import ImageArray
 
-__all__ = ["Pace", "Screen", "composed"]
-
 
 class Screen:
     """State of one browser: it is drawn when ``wanted`` is ahead, and until it is sharp."""

@@ -13,8 +13,6 @@ from torch import Tensor
 from gridreg.errors import InputError
 from gridreg.rendering import Field, OccupancyGrid
 
-__all__ = ["DensityVolume", "SeenDensity", "sample_density", "surface_threshold"]
-
 Array = NDArray[np.float32]
 
 

@@ -20,8 +20,6 @@ from gridreg.machine import temporary_beside
 from gridreg.training.files import check_output_folder, output_errors, writing
 from gridreg.training.images import ImageArray
 
-__all__ = ["check_target", "find_ffmpeg", "write_video"]
-
 
 def check_target(path: Path, fps: float) -> None:
     """Refuse what cannot become a video, before it is rendered; make the folder that it goes to.

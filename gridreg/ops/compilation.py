@@ -10,8 +10,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-__all__ = ["clock_stopped", "compile_seconds", "compiling", "telling_compilation", "timed", "work_clock"]
-
 _spent = 0.0
 _stood = 0.0
 _read = 0

@@ -13,8 +13,6 @@ from torch import Tensor
 from gridreg.errors import InputError
 from gridreg.ops.dispatch import is_cpu_float32, operation
 
-__all__ = ["accumulate", "check_packed", "composite_weights", "pixels", "ray_of_sample", "terminate"]
-
 # Elements of a padded rectangle (rays, samples): bounds the temporary memory to some tens of megabytes.
 _BLOCK = 1 << 20
 

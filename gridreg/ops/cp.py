@@ -16,8 +16,6 @@ from gridreg.ops.ray_marching import (
     march_density,
 )
 
-__all__ = ["cp_density", "cp_features", "cp_march_density"]
-
 
 def _check(u: Tensor, lines: Sequence[Tensor], open_channels: int | None = None) -> None:
     check_grids(u, (), lines, open_channels)

@@ -24,8 +24,6 @@ from torch import Tensor
 
 from gridreg.errors import InputError
 
-__all__ = ["Operation", "chosen_backend", "is_cpu_float32", "operation", "use_backend"]
-
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
 _CHOICES = ("auto", "compiled", "torch")

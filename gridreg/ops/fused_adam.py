@@ -16,8 +16,6 @@ from gridreg.ops.dispatch import operation
 if TYPE_CHECKING:
     from gridreg.base import LocalTerm
 
-__all__ = ["AdamStep", "FusedAdam", "Moments", "adam_step", "add_term", "axes_of", "neighbour_pairs"]
-
 _KINDS = ("total_variation", "l1", "l2")
 
 

@@ -9,8 +9,6 @@ from contextlib import contextmanager
 import torch
 from torch import Tensor
 
-__all__ = ["accumulate_into_grad", "gradient_buffers", "rounding_fraction"]
-
 _local = threading.local()
 
 

@@ -11,16 +11,6 @@ from torch.nn import functional as F
 from gridreg.errors import InputError
 from gridreg.ops.dispatch import is_cpu_float32
 
-__all__ = [
-    "LINE_AXES",
-    "PLANE_AXES",
-    "check_grids",
-    "close_channels",
-    "interpolate_line",
-    "interpolate_plane",
-    "suits_cpu",
-]
-
 PLANE_AXES = ((0, 1), (0, 2), (1, 2))
 LINE_AXES = (2, 1, 0)
 

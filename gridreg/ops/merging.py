@@ -20,15 +20,6 @@ from torch.nn import functional as F
 from gridreg.ops.composite import check_packed, ray_of_sample
 from gridreg.ops.dispatch import operation
 
-__all__ = [
-    "UNIT",
-    "FeatureMeans",
-    "average_features",
-    "merge_neighbours",
-    "merge_samples",
-    "spread_to_samples",
-]
-
 # Of weights as integers: fine enough for any that counts, and eight million samples of weight 1 still add up.
 UNIT = 2.0**40
 

@@ -19,8 +19,6 @@ from gridreg.encodings import positional_encoding
 from gridreg.errors import InputError
 from gridreg.ops.dispatch import operation
 
-__all__ = ["Block", "Layer", "Precision", "encoded_mlp", "mlp", "product_dtype"]
-
 Precision: TypeAlias = Literal["float32", "bfloat16", "auto"]
 """Of products: "auto" is bfloat16 on processors that multiply it (AVX-512 BF16), float32 on others."""
 

@@ -14,18 +14,6 @@ from gridreg.errors import InputError
 from gridreg.ops.composite import terminate
 from gridreg.ops.dispatch import operation
 
-__all__ = [
-    "CELL_TOLERANCE",
-    "Activation",
-    "MarchArguments",
-    "RayMarchResult",
-    "check_march",
-    "check_march_density",
-    "march",
-    "march_density",
-    "steps_bound",
-]
-
 # In cells: entry points computed by a box intersection may fall outside the box by their rounding.
 CELL_TOLERANCE = 1e-3
 # Elements of a (rays, steps) block: bounds the temporary memory to some tens of megabytes.

@@ -24,8 +24,6 @@ from gridreg.ops.ray_marching import (
     march_density,
 )
 
-__all__ = ["vm_density", "vm_features", "vm_march_density"]
-
 
 def _products(
     u: Tensor, planes: Sequence[Tensor], lines: Sequence[Tensor], open_channels: int | None

@@ -8,17 +8,11 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from gridreg.base import NOT_NEGATIVE, Context, Regularizer, register, within
+from gridreg.attach.sites import NOT_NEGATIVE, within
+from gridreg.base import Context, Regularizer, register
 from gridreg.errors import InputError
 from gridreg.samples import RaySamples
 from gridreg.schedules import Numeric
-
-__all__ = [
-    "ExpectedBackground",
-    "RandomBackground",
-    "opacity_error",
-    "random_background",
-]
 
 # Mean and variance of a colour drawn uniformly from [0, 1].
 _MEAN, _VARIANCE = 1 / 2, 1 / 12

@@ -8,13 +8,11 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from gridreg.attach.sites import Place
-from gridreg.base import Context, register, within
+from gridreg.attach.sites import Place, within
+from gridreg.base import Context, register
 from gridreg.regularizers import mask_functions as masks
 from gridreg.regularizers.mask_base import Mask
 from gridreg.schedules import Linear, Numeric
-
-__all__ = ["CosineMask", "FixedMask", "FrequencyMask"]
 
 
 @register

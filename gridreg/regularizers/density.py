@@ -13,8 +13,6 @@ from gridreg.regularizers.rays import SamplesPenalty
 from gridreg.samples import RaySamples
 from gridreg.schedules import Numeric
 
-__all__ = ["CauchySparsity", "Eikonal", "cauchy_sparsity", "eikonal"]
-
 
 def cauchy_sparsity(samples: RaySamples) -> Tensor:
     """Sum over samples of ``log(1 + 2 density^2)``: most of space is empty.

@@ -8,12 +8,11 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from gridreg.base import NOT_NEGATIVE, Context, Regularizer, register, within
+from gridreg.attach.sites import NOT_NEGATIVE, within
+from gridreg.base import Context, Regularizer, register
 from gridreg.errors import InputError
 from gridreg.samples import RaySamples
 from gridreg.schedules import Numeric
-
-__all__ = ["DepthPrior", "depth_correlation", "depth_ranking", "depth_residual"]
 
 # Variances below this, in squared units, are none: keeps the quotients of flat depths finite.
 _TINY = 1e-12

@@ -8,12 +8,10 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from gridreg.attach.sites import SiteLike
-from gridreg.base import Context, Regularizer, register, within
+from gridreg.attach.sites import SiteLike, within
+from gridreg.base import Context, Regularizer, register
 from gridreg.regularizers.mask_base import broadcast, remember, spread
 from gridreg.schedules import Linear, Numeric, check_numeric
-
-__all__ = ["ComponentDropout", "component_dropout"]
 
 _HIGHEST = 0.999
 _RAMP = Linear(0.0, 0.2)

@@ -13,8 +13,6 @@ from torch import Tensor
 
 from gridreg.errors import InputError
 
-__all__ = ["Boundary", "fourier_low_pass", "gaussian_blur", "low_pass_response"]
-
 Boundary: TypeAlias = Literal["periodic", "mirror"]
 
 _CHANNELS_LAST = ((4, torch.channels_last), (5, torch.channels_last_3d))

@@ -17,8 +17,6 @@ from gridreg.errors import InputError, near_names
 from gridreg.samples import RaySamples
 from gridreg.schedules import Numeric
 
-__all__ = ["GridFunction", "SamplesFunction", "from_function"]
-
 Function: TypeAlias = Callable[[Any], Tensor]
 
 

@@ -8,13 +8,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gridreg.base import NOT_NEGATIVE, Context, Regularizer, register, within
+from gridreg.attach.sites import NOT_NEGATIVE, within
+from gridreg.base import Context, Regularizer, register
 from gridreg.errors import InputError
 from gridreg.samples import RaySamples
 from gridreg.schedules import Numeric
 from gridreg.segments import optical_depth_to_weights
-
-__all__ = ["DistanceGradientScaling", "scale_gradients_by_distance"]
 
 
 class _ScaledGradient(torch.autograd.Function):

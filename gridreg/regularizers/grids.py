@@ -16,8 +16,6 @@ from gridreg.base import Context, LocalTerm, Regularizer, register
 from gridreg.regularizers.total_variation import spatial_axes
 from gridreg.schedules import Numeric
 
-__all__ = ["L1", "L2", "Orthogonality", "l1", "l2", "orthogonality"]
-
 
 def l1(values: Tensor) -> Tensor:
     """Mean absolute value of a grid.

@@ -8,14 +8,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gridreg.attach.sites import Place
-from gridreg.base import NOT_NEGATIVE, Context, register, within
+from gridreg.attach.sites import NOT_NEGATIVE, Place, within
+from gridreg.base import Context, register
 from gridreg.errors import InputError
 from gridreg.regularizers import mask_functions as masks
 from gridreg.regularizers.mask_base import Mask
 from gridreg.schedules import Linear, Numeric, check_until, end_step
-
-__all__ = ["LevelMask", "ViewDependenceMask"]
 
 
 @register

@@ -9,14 +9,12 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor
 
-from gridreg.attach.sites import SiteLike
-from gridreg.base import NOT_NEGATIVE, Context, Regularizer, register, within
+from gridreg.attach.sites import NOT_NEGATIVE, SiteLike, within
+from gridreg.base import Context, Regularizer, register
 from gridreg.errors import InputError
 from gridreg.regularizers.filters import Boundary, fourier_low_pass, gaussian_blur
 from gridreg.regularizers.total_variation import NO_NEIGHBOURS
 from gridreg.schedules import Linear, Numeric
-
-__all__ = ["FourierLowPass", "GridBlur", "annealed_radius"]
 
 _FOURIERF_KEEP = Linear(0.3, 1.0, until=2000)
 

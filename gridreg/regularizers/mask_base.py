@@ -17,8 +17,6 @@ from gridreg.errors import InputError
 from gridreg.regularizers.mask_functions import channel_ranks
 from gridreg.schedules import check_until, drawing_axes, drawn_steps, fixed_end
 
-__all__ = ["Mask", "broadcast", "remember", "spread"]
-
 _ALL = outputs("")
 
 

@@ -10,17 +10,6 @@ from torch import Tensor
 
 from gridreg.errors import InputError
 
-__all__ = [
-    "authors_frequency_mask",
-    "channel_ranks",
-    "cosine_mask",
-    "fixed_mask",
-    "frequency_mask",
-    "level_mask",
-    "printed_frequency_mask",
-    "spherical_bands",
-]
-
 
 def frequency_mask(channels: int, step: float, total_steps: float, *, block: int = 3) -> Tensor:
     """FreeNeRF's frequency mask in block form: channels open from the first, a block at a time.

@@ -7,12 +7,11 @@ from typing import Literal
 
 from torch import Tensor
 
-from gridreg.base import NOT_NEGATIVE, Context, Regularizer, register
+from gridreg.attach.sites import NOT_NEGATIVE
+from gridreg.base import Context, Regularizer, register
 from gridreg.errors import InputError
 from gridreg.samples import RaySamples
 from gridreg.schedules import Numeric
-
-__all__ = ["OcclusionLoss", "occlusion_loss"]
 
 
 def occlusion_loss(

@@ -8,12 +8,10 @@ from typing import Any, TypeAlias
 
 from torch import Tensor
 
-from gridreg.attach.sites import Grid, SiteLike
-from gridreg.base import NOT_NEGATIVE, Context, Regularizer, register, within
+from gridreg.attach.sites import NOT_NEGATIVE, Grid, SiteLike, within
+from gridreg.base import Context, Regularizer, register
 from gridreg.errors import InputError
 from gridreg.schedules import Numeric
-
-__all__ = ["LearningRate", "WeightDecay", "split_groups"]
 
 Groups: TypeAlias = list[dict[str, Any]]
 

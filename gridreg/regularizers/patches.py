@@ -13,15 +13,6 @@ from gridreg.regularizers.rays import TINY, SamplesPenalty, alpha_of
 from gridreg.samples import RaySamples
 from gridreg.schedules import Geometric, Numeric
 
-__all__ = [
-    "DepthSmoothness",
-    "NormalSmoothness",
-    "RayKL",
-    "depth_smoothness",
-    "normal_smoothness",
-    "ray_kl",
-]
-
 _REGNERF_WEIGHT = Geometric(400.0, 0.1, until=512)
 
 

@@ -13,8 +13,6 @@ from gridreg.regularizers.rays import SamplesPenalty
 from gridreg.samples import RaySamples
 from gridreg.schedules import Numeric
 
-__all__ = ["ProposalLoss", "proposal_loss"]
-
 # As in nerfstudio's `interlevel_loss`; keeps the quotient finite where nothing was found.
 _TINY = 1e-7
 # Intervals that touch should not overlap by rounding: an end counts from this fraction of its length inwards.

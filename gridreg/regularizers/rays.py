@@ -9,21 +9,12 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from gridreg.base import Context, Regularizer, register, within
+from gridreg.attach.sites import within
+from gridreg.base import Context, Regularizer, register
 from gridreg.errors import InputError
 from gridreg.samples import RaySamples
 from gridreg.schedules import Numeric
 from gridreg.segments import before_less_behind
-
-__all__ = [
-    "DistortionLoss",
-    "OpacityEntropy",
-    "RayEntropy",
-    "SamplesPenalty",
-    "distortion",
-    "opacity_entropy",
-    "ray_entropy",
-]
 
 # Keeps logarithms of fractions finite; the value that InfoNeRF's program adds.
 TINY = 1e-10

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from gridreg.base import NOT_NEGATIVE, Context, Regularizer, register, within
+from gridreg.attach.sites import NOT_NEGATIVE, within
+from gridreg.base import Context, Regularizer, register
 from gridreg.schedules import Numeric
-
-__all__ = ["SampleSpaceAnnealing", "anneal_space"]
 
 
 def anneal_space(

@@ -10,19 +10,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from gridreg.attach.sites import Grid, SiteLike
-from gridreg.base import NOT_NEGATIVE, Context, LocalTerm, Regularizer, register, within
+from gridreg.attach.sites import NOT_NEGATIVE, Grid, SiteLike, within
+from gridreg.base import Context, LocalTerm, Regularizer, register
 from gridreg.errors import InputError
 from gridreg.schedules import Linear, Numeric
-
-__all__ = [
-    "NO_NEIGHBOURS",
-    "TimeSmoothness",
-    "TotalVariation",
-    "spatial_axes",
-    "time_smoothness",
-    "total_variation",
-]
 
 NO_NEIGHBOURS = (
     "has no spatial axis longer than 1 (in a table, cells side by side need not be neighbours in space); "

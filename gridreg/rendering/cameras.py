@@ -9,8 +9,6 @@ from torch import Tensor
 
 from gridreg.errors import InputError
 
-__all__ = ["Camera", "Lens"]
-
 
 @dataclass(frozen=True)
 class Lens:

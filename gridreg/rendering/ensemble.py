@@ -11,8 +11,6 @@ from torch import Tensor, nn
 from gridreg.errors import InputError
 from gridreg.rendering.occupancy import OccupancyGrid
 
-__all__ = ["Ensemble", "deviation_of"]
-
 
 def deviation_of(images: Tensor) -> Tensor:
     """Return how far images of several members are apart, by pixel: the root mean square, over the channels, of their

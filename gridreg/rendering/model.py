@@ -18,8 +18,6 @@ from gridreg.rendering.rays import Rays, camera_rays
 from gridreg.rendering.render import MarchSettings, Rendered, render_rays
 from gridreg.rendering.surroundings import JoinedSurroundings, Surroundings
 
-__all__ = ["Model"]
-
 
 def _white() -> Tensor:
     return torch.ones(3)

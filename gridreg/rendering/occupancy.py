@@ -10,8 +10,6 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-__all__ = ["OccupancyGrid", "visual_hull"]
-
 Density = Callable[[Tensor], Tensor]
 
 

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-__all__ = ["Rays", "box_intersection", "camera_rays", "pixel_rays"]
-
 
 @dataclass(frozen=True)
 class Rays:

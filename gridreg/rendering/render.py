@@ -13,15 +13,6 @@ from gridreg.rendering.occupancy import OccupancyGrid
 from gridreg.rendering.rays import Rays, box_intersection
 from gridreg.samples import RaySamples
 
-__all__ = [
-    "Field",
-    "MarchSettings",
-    "Rendered",
-    "SampleHook",
-    "render_rays",
-]
-
-
 _BLOCK = 1 << 16
 
 

@@ -15,8 +15,6 @@ from gridreg.rendering.occupancy import OccupancyGrid
 from gridreg.rendering.rays import Rays, box_intersection
 from gridreg.rendering.render import MarchSettings, Rendered, render_rays
 
-__all__ = ["CONTRACTED", "JoinedSurroundings", "Surroundings", "contract"]
-
 CONTRACTED = torch.tensor([[-2.0] * 3, [2.0] * 3])
 """Box ``(2, 3)`` that holds all of contracted space."""
 

@@ -13,8 +13,6 @@ from gridreg.training.rays import Batch, RayBank
 from gridreg.training.settings import TrainSettings
 from gridreg.training.surroundings import SurroundingsTraining, wants_surroundings
 
-__all__ = ["Beside"]
-
 
 class Beside:
     """Surroundings and exposures of a run.

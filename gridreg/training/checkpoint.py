@@ -38,8 +38,6 @@ from gridreg.machine import check_memory
 from gridreg.training.files import flush, output_errors, remove_folder, write_json
 from gridreg.training.state_tree import flatten_state, unflatten_state
 
-__all__ = ["FORMAT_VERSION", "Checkpoint", "has_checkpoint", "load_checkpoint", "save_checkpoint", "sound"]
-
 FORMAT_VERSION = 1
 """Raised by one whenever an older gridreg could not read what is written."""
 

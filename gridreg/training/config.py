@@ -18,8 +18,6 @@ from gridreg.training.files import write_text
 from gridreg.training.strict_yaml import Document, dump_yaml, parse_yaml, read_yaml
 from gridreg.training.typed_data import alternatives, field_types, from_data, to_data
 
-__all__ = ["assignments", "from_data", "from_yaml", "override", "save_yaml", "to_data", "to_yaml"]
-
 T = TypeVar("T")
 
 

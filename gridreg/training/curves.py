@@ -19,8 +19,6 @@ from gridreg.scenes.files import read_text
 from gridreg.training.files import write_text, writing
 from gridreg.training.metrics import json_ready
 
-__all__ = ["History", "draw_curves", "draw_masks"]
-
 Row = dict[str, Any]
 
 

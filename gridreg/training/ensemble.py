@@ -11,8 +11,6 @@ from gridreg.training.checkpoint import has_checkpoint, save_checkpoint, sound
 from gridreg.training.files import check_output_folder, one_writer
 from gridreg.training.loading import checkpoint_of, members_in
 
-__all__ = ["save_ensemble"]
-
 _OF_TRAINER = ("step", "resolution", "field", "handle", "occupancy")
 _OF_RUN = ("march", "warp", "background")
 

@@ -12,8 +12,6 @@ from gridreg.rendering import Camera, Lens, Model, Rendered
 from gridreg.scenes import Views
 from gridreg.training.metrics import image_metrics, psnr
 
-__all__ = ["Scored", "mean_psnr_of", "render_views", "score_views"]
-
 Metrics = Callable[[Tensor, Tensor], dict[str, float]]
 
 

@@ -15,8 +15,6 @@ from gridreg.scenes import Scene
 from gridreg.training.rays import RayBank, meets
 from gridreg.training.settings import TrainSettings
 
-__all__ = ["OccupiedSpace", "carved_box", "cell_size", "march_of", "occupancy_resolution", "resolution_of"]
-
 
 class OccupiedSpace:
     """Box, occupied cells and visual hull of a field in training, and the schedule's events that change them.

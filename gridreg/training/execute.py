@@ -17,7 +17,7 @@ from gridreg.ops.compilation import work_clock
 from gridreg.scenes import Scene
 from gridreg.scenes.notebook import card
 from gridreg.training.checkpoint import has_checkpoint
-from gridreg.training.config import save_yaml, to_data
+from gridreg.training.config import save_yaml
 from gridreg.training.curves import History, draw_curves, draw_masks
 from gridreg.training.evaluate import Scored, mean_psnr_of, score_views
 from gridreg.training.exposure import AFFINE_CONVENTION, affine_psnr
@@ -29,8 +29,7 @@ from gridreg.training.record import metrics_record, save_metrics
 from gridreg.training.run import build_trainer, resume_trainer, save_run
 from gridreg.training.settings import RunConfig
 from gridreg.training.trainer import StepReport, Trainer
-
-__all__ = ["Execution", "Watch", "execute"]
+from gridreg.training.typed_data import to_data
 
 
 class Watch(Protocol):

@@ -14,8 +14,6 @@ from gridreg.training.metrics import psnr
 from gridreg.training.rays import RayBank
 from gridreg.training.settings import TrainSettings
 
-__all__ = ["AFFINE_CONVENTION", "Exposure", "affine_corrected", "affine_psnr", "wants_exposure"]
-
 AFFINE_CONVENTION = {
     "psnr_affine": "dB; psnr after the affine map of colours that fits each image best to its target"
 }

@@ -25,18 +25,6 @@ try:
 except ImportError:  # Windows has no such lock.
     fcntl = None  # type: ignore[assignment]
 
-__all__ = [
-    "check_output_folder",
-    "flush",
-    "one_writer",
-    "output_errors",
-    "remove_folder",
-    "write_bytes",
-    "write_json",
-    "write_text",
-    "writing",
-]
-
 _REASONS = {
     errno.ENOSPC: "no space left on the disk; free some or choose another place",
     errno.EDQUOT: "the disk quota is used up; free some space or choose another place",

@@ -19,20 +19,6 @@ from torch import Tensor
 from gridreg.errors import InputError
 from gridreg.training.files import write_bytes
 
-__all__ = [
-    "DEPTH_COLOURS",
-    "ImageArray",
-    "coloured",
-    "depth_limits",
-    "fading_into_white",
-    "labelled",
-    "row",
-    "save_png",
-    "scale_bar",
-    "thumbnail",
-    "to_uint8",
-]
-
 ImageArray = NDArray[np.uint8]
 
 DEPTH_COLOURS = "turbo"

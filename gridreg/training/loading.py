@@ -25,15 +25,13 @@ from gridreg.scenes.gate import check_extent
 from gridreg.scenes.notebook import card
 from gridreg.scenes.views import background_colour
 from gridreg.training.checkpoint import has_checkpoint, load_checkpoint, sound
-from gridreg.training.config import from_data
 from gridreg.training.events import march_of
 from gridreg.training.rays import NdcWarp
 from gridreg.training.run import check_grid, regularizers_of
 from gridreg.training.settings import RunConfig
 from gridreg.training.surroundings import make_surroundings
 from gridreg.training.trainer import load_field
-
-__all__ = ["LoadedRun", "checkpoint_of", "ensemble_of", "load_run", "members_in"]
+from gridreg.training.typed_data import from_data
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)

@@ -25,16 +25,6 @@ from torch import Tensor
 
 from gridreg.errors import InputError
 
-__all__ = [
-    "SsimConvention",
-    "image_metrics",
-    "json_number",
-    "json_ready",
-    "mean_metrics",
-    "psnr",
-    "ssim",
-]
-
 SsimConvention = Literal["gaussian", "uniform"]
 
 # Keywords of scikit-image, and the smallest image that its window fits into, pixels.

@@ -18,8 +18,6 @@ from gridreg.training.files import one_writer
 from gridreg.training.presets import load_preset, preset_names
 from gridreg.training.settings import RunConfig
 
-__all__ = ["TrainOptions", "configure", "output_folder"]
-
 # In --help without "(default: None)": the text of each option says what holds without it.
 _Folder = Annotated[Path | None, tyro.conf.arg(metavar="DIR", help_behavior_hint="")]
 _File = Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")]

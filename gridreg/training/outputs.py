@@ -27,15 +27,6 @@ from gridreg.training.images import (
     to_uint8,
 )
 
-__all__ = [
-    "comparison",
-    "depth_image",
-    "error_map",
-    "save_contact_sheet",
-    "save_scored",
-    "save_view",
-]
-
 MAX_ERROR = 0.5
 """Upper end of the error maps' scale; fixed, so that images of different runs compare."""
 

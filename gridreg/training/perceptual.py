@@ -28,8 +28,6 @@ from torch import Tensor
 from gridreg.errors import InputError
 from gridreg.scenes.files import read_bytes
 
-__all__ = ["InputRange", "Lpips", "Network", "read_lpips"]
-
 Network = Literal["alex", "vgg"]
 InputRange = Literal["signed", "unit"]
 

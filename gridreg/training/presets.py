@@ -8,8 +8,6 @@ from gridreg.errors import ConfigError, near_names
 from gridreg.training.config import from_yaml
 from gridreg.training.settings import RunConfig
 
-__all__ = ["load_preset", "preset_names", "preset_text"]
-
 
 def _folder() -> Path:
     """Installed beside this file; in a checkout, ``examples/configs``, where a reader looks for them."""

@@ -21,8 +21,6 @@ from typing import Any, TextIO
 from gridreg.machine import usable_cores
 from gridreg.ops.compilation import telling_compilation, work_clock
 
-__all__ = ["Interruption", "Progress", "clock_time", "compilation_shown", "interruptible"]
-
 _BAR = 20
 _RATE_WINDOW = 20.0
 _REFRESH = 0.2

@@ -15,8 +15,6 @@ from gridreg.rendering import OccupancyGrid, Rays, box_intersection, pixel_rays
 from gridreg.scenes import Scene, Views, ndc_rays
 from gridreg.scenes.pixels import as_floats
 
-__all__ = ["Batch", "NdcWarp", "RayBank", "behind", "known_alpha", "meets", "warp_of"]
-
 
 @dataclass(frozen=True)
 class Batch:

@@ -10,8 +10,6 @@ from gridreg.training.files import write_json
 from gridreg.training.metrics import json_ready, mean_metrics
 from gridreg.training.versions import versions
 
-__all__ = ["CONVENTIONS", "metrics_record", "save_metrics", "summary"]
-
 CONVENTIONS = {
     "psnr": "dB; mean over images of -10 log10(MSE), images in [0, 1] after clamping",
     "ssim_gaussian": "11x11 Gaussian window, sigma 1.5, population covariance (TensoRF and most)",

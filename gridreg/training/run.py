@@ -17,20 +17,10 @@ from gridreg.fields import make_field
 from gridreg.machine import check_memory
 from gridreg.scenes import IN_PLACE, Scene, builtin_scene, default_protocol, load_scene
 from gridreg.training.checkpoint import load_checkpoint, save_checkpoint, sound
-from gridreg.training.config import to_data
 from gridreg.training.events import carved_box, resolution_of
 from gridreg.training.settings import RunConfig
 from gridreg.training.trainer import Trainer
-
-__all__ = [
-    "build_trainer",
-    "check_grid",
-    "check_size",
-    "open_scene",
-    "regularizers_of",
-    "resume_trainer",
-    "save_run",
-]
+from gridreg.training.typed_data import to_data
 
 
 def open_scene(

@@ -9,8 +9,6 @@ from typing import Any, Literal
 
 from gridreg.errors import ConfigError
 
-__all__ = ["RunConfig", "TrainSettings"]
-
 _AT_LEAST = {
     "steps": 1,
     "rays": 1,

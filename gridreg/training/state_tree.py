@@ -16,8 +16,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["flatten_state", "unflatten_state"]
-
 
 def flatten_state(state: Any) -> tuple[dict[str, Tensor], Any]:
     """Split nested state into tensors and a JSON-able tree.

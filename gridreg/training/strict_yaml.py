@@ -20,8 +20,6 @@ import yaml
 from gridreg.errors import ConfigError, KeyPath
 from gridreg.scenes.files import read_text
 
-__all__ = ["Document", "dump_yaml", "parse_yaml", "read_yaml"]
-
 _RESOLVERS = [
     ("bool", r"true|True|TRUE|false|False|FALSE", "tTfF"),
     ("int", r"[-+]?[0-9]+(?:_[0-9]+)*|0o[0-7]+|0x[0-9a-fA-F]+", "-+0123456789"),

@@ -14,8 +14,6 @@ from gridreg.scenes import Scene
 from gridreg.scenes.focus import surround_focus
 from gridreg.training.settings import TrainSettings
 
-__all__ = ["SurroundingsTraining", "make_surroundings", "wants_surroundings"]
-
 # Nodes along an edge at first and in the end. Few, and without dependence on direction: little that a few photographs
 # could overfit. A fast rate and much opacity at first, as colours must not come from fog.
 _FIRST, _LAST = 16, 128

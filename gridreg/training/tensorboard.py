@@ -9,8 +9,6 @@ from gridreg.errors import InputError
 from gridreg.training.execute import Execution
 from gridreg.training.trainer import StepReport
 
-__all__ = ["TensorBoard"]
-
 
 class TensorBoard:
     """Writes the figures of a run into ``tensorboard/`` in its folder; pass it to `execute` as ``watch``.

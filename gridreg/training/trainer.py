@@ -23,8 +23,6 @@ from gridreg.training.rays import Batch, RayBank, behind, known_alpha, warp_of
 from gridreg.training.settings import TrainSettings
 from gridreg.training.unseen import UnseenPatches
 
-__all__ = ["StepReport", "Trainer"]
-
 # Iterations from one that is averaged to the next: neighbours hardly differ.
 _AVERAGED = 5
 

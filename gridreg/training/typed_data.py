@@ -19,8 +19,6 @@ from typing import Any, Literal, TypeVar, Union
 from gridreg.errors import RENAMED_KEYS, KeyPath
 from gridreg.training.strict_yaml import Document
 
-__all__ = ["alternatives", "field_types", "from_data", "to_data"]
-
 T = TypeVar("T")
 # A thousand runs of a store are a thousand times the same class.
 _type_hints = functools.cache(typing.get_type_hints)

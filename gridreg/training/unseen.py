@@ -12,8 +12,6 @@ from gridreg.scenes import Views
 from gridreg.scenes.extent import focus_point
 from gridreg.training.rays import NdcWarp
 
-__all__ = ["UnseenPatches", "poses_between"]
-
 
 def poses_between(first: Tensor, second: Tensor, share: Tensor, focus: Tensor) -> Tensor:
     """Cameras on the way from one to another.

@@ -11,8 +11,6 @@ import torch
 import gridreg
 from gridreg.machine import usable_cores
 
-__all__ = ["cpu_model", "package_version", "versions"]
-
 _PACKAGES = ("torch", "numpy", "numba")
 
 

@@ -20,10 +20,10 @@ from gridreg.ablation.table_report import read_table
 from gridreg.ablation.workers import Worker
 from gridreg.scenes import load_scene
 from gridreg.training import RunConfig, load_run
-from gridreg.training.config import from_yaml, to_data
+from gridreg.training.config import from_yaml
 from gridreg.training.curves import History
 from gridreg.training.run import build_trainer, resume_trainer, save_run
-from gridreg.training.typed_data import from_data
+from gridreg.training.typed_data import from_data, to_data
 from tests.fuzz.formats import (
     IMAGES,
     NUMBERS,

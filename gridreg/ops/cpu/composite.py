@@ -14,8 +14,6 @@ from gridreg.ops.cpu.jit.compiler import kernel
 from gridreg.ops.cpu.jit.launch import launch
 from gridreg.ops.cpu.jit.table import Matrix, Vector, float32, int64, uint8
 
-__all__ = ["composite_weights", "pixels", "terminate"]
-
 # Rays of one task.
 _RAYS = 64
 

@@ -22,8 +22,6 @@ from gridreg.ops.cpu.jit.simd import load, scalar_zero
 from gridreg.ops.cpu.jit.table import Vector, float32, int32, int64, scratch
 from gridreg.ops.cpu.jit.workspace import workspace
 
-__all__ = ["ALONE", "ENTRY", "TASKS", "Listing", "list_by_row", "nonzero_gradients", "span"]
-
 # Tasks for each axis or plane: more than threads, so that an unlucky thread does not hold the others up.
 TASKS = 16
 # Fewer samples than this are not worth a second thread.

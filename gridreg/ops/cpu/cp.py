@@ -20,8 +20,6 @@ from gridreg.ops.cpu.jit.simd import LANES, load, scalar_zero, store, total, vec
 from gridreg.ops.cpu.jit.table import Matrix, Vector, float32, int32, int64, scratch
 from gridreg.ops.cpu.jit.workspace import workspace
 
-__all__ = ["density", "density_backward", "features", "features_backward", "product_sum", "segments_of"]
-
 
 @inline
 def segments_of(nodes: Any, fractions: Any, q: int, channels: int) -> Any:

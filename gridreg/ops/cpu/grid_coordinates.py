@@ -8,8 +8,6 @@ from gridreg.ops.cpu.jit.compiler import exact, inline
 from gridreg.ops.cpu.jit.simd import load, scalar_zero
 from gridreg.ops.cpu.jit.table import Vector, float32, int32, int64
 
-__all__ = ["BATCH", "COORDINATES", "axes", "batch", "locate", "node"]
-
 # Samples of a batch: their coordinates fit into the first-level cache.
 BATCH = 256
 # One number for each axis of each of them.

@@ -12,17 +12,6 @@ from gridreg.ops.cpu.jit.compiler import inline
 from gridreg.ops.cpu.jit.simd import load, prefetch
 from gridreg.ops.cpu.jit.table import float32
 
-__all__ = [
-    "Cell",
-    "Segment",
-    "bilinear",
-    "cell_weights",
-    "linear",
-    "lookahead",
-    "prefetch_cell",
-    "prefetch_row",
-]
-
 # How far ahead nodes are asked for, in channels. Measured: with few channels memory needs some samples of time, with
 # many more requests than the processor keeps open push each other out.
 _AHEAD = 96

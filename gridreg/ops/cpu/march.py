@@ -15,8 +15,6 @@ from gridreg.ops.cpu.jit.compiler import exact, inline, kernel
 from gridreg.ops.cpu.jit.launch import launch
 from gridreg.ops.cpu.jit.table import Cube, Matrix, Vector, float32, int64, uint8
 
-__all__ = ["MarchBits", "distance_of", "mark", "march", "next_bit", "sample_at"]
-
 _REST = np.int64(2**63 - 1)
 # Edge, in cells, of the blocks that are skipped whole when nothing in them is occupied.
 _COARSE = np.uint32(4)

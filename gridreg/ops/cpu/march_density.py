@@ -23,8 +23,6 @@ from gridreg.ops.cpu.march import MarchBits, distance_of, next_bit, sample_at
 from gridreg.ops.cpu.vm import Batch, find_cells, look_up, shape_of
 from gridreg.ops.ray_marching import Activation, RayMarchResult
 
-__all__ = ["march_density"]
-
 # Samples between two looks at the transmittance: so many may be computed in vain behind the last one.
 _GROUP = LANES
 # Samples placed on the grid at a time, of which most may be in vain.

@@ -14,8 +14,6 @@ from gridreg.ops.cpu.jit.compiler import inline, kernel
 from gridreg.ops.cpu.jit.launch import launch
 from gridreg.ops.cpu.jit.table import Matrix, Vector, float32, float64, int64
 
-__all__ = ["merge_samples", "spread_to_samples"]
-
 # Rays of one task; samples or groups of one.
 _RAYS = 64
 _SAMPLES = 4096

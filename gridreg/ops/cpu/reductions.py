@@ -12,8 +12,6 @@ from gridreg.ops.cpu.jit.launch import launch
 from gridreg.ops.cpu.jit.simd import LANES, load, scalar_zero, store, vector_zero
 from gridreg.ops.cpu.jit.table import Matrix, Vector, float32, float64, int32, int64
 
-__all__ = ["add_rows", "reduce_sum", "round_stochastically"]
-
 # Elements of one task.
 _PIECE = 4096
 

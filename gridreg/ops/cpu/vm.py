@@ -23,8 +23,6 @@ from gridreg.ops.cpu.jit.launch import launch
 from gridreg.ops.cpu.jit.simd import LANES, scalar_zero, store, total, vector_zero
 from gridreg.ops.cpu.jit.table import Cube, Matrix, Vector, float32, int32, int64, scratch, uint16
 
-__all__ = ["Batch", "density", "features", "find_cells", "look_up", "shape_of"]
-
 
 class Batch(NamedTuple):
     """Samples placed on the grid: nodes and fractions as of `locate`, first element of their cells in each plane."""

@@ -30,8 +30,6 @@ from gridreg.ops.cpu.jit.table import Cube, Matrix, Vector, float32, int32, int6
 from gridreg.ops.cpu.jit.workspace import workspace
 from gridreg.ops.cpu.reductions import reduce_sum
 
-__all__ = ["density_backward", "features_backward"]
-
 
 class _Owned(NamedTuple):
     """Gradients that a task may add to.

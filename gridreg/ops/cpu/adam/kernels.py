@@ -11,8 +11,6 @@ from gridreg.ops.cpu.jit.simd_math import divide, flush, magnitude, sign, square
 from gridreg.ops.cpu.jit.table import Matrix, Table, Vector, float32, float64, int64, vector
 from gridreg.ops.fused_adam import Moments
 
-__all__ = ["Factors", "flat_step", "grid_step", "keep_edges"]
-
 
 class Factors(NamedTuple):
     """Factors of what is added to the gradient.

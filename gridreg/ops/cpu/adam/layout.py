@@ -11,8 +11,6 @@ from torch import Tensor
 
 from gridreg.ops.fused_adam import neighbour_pairs
 
-__all__ = ["FLAT", "PIECE", "Form", "GridTasks", "Layout", "flat_tasks", "form_of", "grid_tasks", "layout"]
-
 # Elements worked on at a time: all that one piece reads and writes stays in the first-level cache.
 PIECE = 1024
 # Elements of a task where no term looks at neighbours.

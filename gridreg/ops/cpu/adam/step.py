@@ -16,8 +16,6 @@ from gridreg.ops.cpu.jit.workspace import workspace
 from gridreg.ops.dispatch import is_cpu_float32
 from gridreg.ops.fused_adam import AdamStep, adam_step, add_term, axes_of
 
-__all__ = ["update_flat", "update_grids"]
-
 # Blocks of slabs that may be updated at the same time; fixed, so that sums do not depend on threads.
 _BLOCKS = 16
 

@@ -15,8 +15,6 @@ try:
 except ImportError:  # Windows has no such lock.
     fcntl = None  # type: ignore[assignment]
 
-__all__ = ["can_lock", "discard_damaged", "forget_outdated", "one_process"]
-
 
 def can_lock() -> bool:
     """Whether this system locks files, so that processes can wait for each other."""

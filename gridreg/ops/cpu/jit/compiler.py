@@ -37,8 +37,6 @@ from gridreg.ops.compilation import compiling, timed
 from gridreg.ops.cpu.jit.cache import can_lock, discard_damaged, forget_outdated, one_process
 from gridreg.ops.cpu.jit.table import TABLE, cube, integer, matrix, next_task, real, vector
 
-__all__ = ["Kernel", "exact", "inline", "kernel"]
-
 # Reordering and contraction make sums fast; not-a-number and infinity keep their meaning, as a run must see them.
 _FAST = {"contract", "nsz", "arcp", "reassoc"}
 _OPTIONS: dict[str, Any] = {"error_model": "numpy", "boundscheck": False}

@@ -28,8 +28,6 @@ from torch import Tensor
 
 from gridreg.ops.cpu.jit.compiler import Kernel
 
-__all__ = ["launch", "runtime"]
-
 _Team = Callable[[int, int, int], None]
 _NATIVE = ctypes.CFUNCTYPE(None, ctypes.c_void_p)
 _state: dict[str, Any] = {"forked": False}

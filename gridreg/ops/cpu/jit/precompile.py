@@ -18,8 +18,6 @@ import sys
 from gridreg.machine import usable_cores
 from gridreg.ops.cpu.mlp.gemm_tile import has
 
-__all__ = ["main", "start"]
-
 _SWITCH = "GRIDREG_COMPILE_AHEAD"
 # Of a run with a VM field, from the one that it compiles last. Of two, the first is for processors that
 # multiply bfloat16, the second for others.

@@ -27,8 +27,6 @@ from numba.extending import models, register_model
 
 from gridreg.ops.cpu.jit.table import intrinsic
 
-__all__ = ["LANES", "load", "prefetch", "bf16_bits", "scalar_zero", "store", "total", "vector_zero"]
-
 LANES = 8
 _FLAGS = ("contract", "nsz", "arcp", "reassoc")
 _LLVM = ir.VectorType(ir.FloatType(), LANES)

@@ -14,8 +14,6 @@ from numba import types
 from gridreg.ops.cpu.jit.compiler import inline
 from gridreg.ops.cpu.jit.table import float32, intrinsic
 
-__all__ = ["TINY", "divide", "flush", "magnitude", "sign", "sine_and_cosine", "softplus", "square_root"]
-
 # No moment of an optimizer matters below, and subnormal numbers are slow on some processors.
 TINY = 1e-30
 # Half of pi in three parts, each a float32; what is multiplied and added at once is not rounded between.

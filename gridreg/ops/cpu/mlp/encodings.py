@@ -12,8 +12,6 @@ from gridreg.ops.cpu.jit.simd import LANES, load, scalar_zero, store, vector_zer
 from gridreg.ops.cpu.jit.simd_math import sine_and_cosine
 from gridreg.ops.cpu.jit.table import float32, int64, integer, vector
 
-__all__ = ["MOST_OCTAVES", "PER_BLOCK", "copy_rows", "decode_rows", "encode_rows"]
-
 MOST_OCTAVES = 8
 """Beyond, doubling angles has cost more than two digits of float32."""
 

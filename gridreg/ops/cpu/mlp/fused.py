@@ -26,8 +26,6 @@ from gridreg.ops.cpu.reductions import reduce_sum
 from gridreg.ops.dispatch import is_cpu_float32
 from gridreg.ops.perceptron import Block, Precision, encoded_mlp, product_dtype
 
-__all__ = ["gradients", "padded_rows"]
-
 _KERNELS = {
     torch.float32: (kernels.forward_f32, kernels.backward_f32),
     torch.bfloat16: (kernels.forward_bf16, kernels.backward_bf16),

@@ -23,26 +23,6 @@ from gridreg.ops.cpu.mlp.gemm_tile import (
     round_lanes,
 )
 
-__all__ = [
-    "GRADIENT_ROWS",
-    "PAIRS",
-    "ROWS",
-    "TASKS",
-    "TILE_ROWS",
-    "WIDEST",
-    "add_weight_gradient_bf16",
-    "add_weight_gradient_f32",
-    "bias_bf16",
-    "bias_f32",
-    "pack",
-    "relu_bf16",
-    "relu_f32",
-    "relu_mask_bf16",
-    "relu_mask_f32",
-    "round_to_bf16",
-    "round_up",
-]
-
 WIDEST = 512
 """Columns of the widest matrix."""
 

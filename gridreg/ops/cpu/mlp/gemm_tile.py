@@ -23,19 +23,6 @@ from numba.core import cgutils
 from gridreg.ops.cpu.jit.simd import bf16_bits
 from gridreg.ops.cpu.jit.table import intrinsic
 
-__all__ = [
-    "BF16",
-    "COLUMNS",
-    "F32",
-    "Arithmetic",
-    "Epilogue",
-    "TileArguments",
-    "element",
-    "has",
-    "register_tile",
-    "round_lanes",
-]
-
 COLUMNS = 16
 """Columns of a vector of results."""
 

@@ -33,15 +33,6 @@ from gridreg.ops.cpu.mlp.gemm import (
 from gridreg.ops.cpu.mlp.gemm_tile import COLUMNS
 from gridreg.ops.cpu.reductions import add_rows
 
-__all__ = [
-    "BackwardArguments",
-    "ForwardArguments",
-    "backward_bf16",
-    "backward_f32",
-    "forward_bf16",
-    "forward_f32",
-]
-
 _PER_LAYER = 3
 # Pasted into a kernel before it is compiled: as functions of their own they would be optimised twice.
 _pasted = njit(inline="always")
