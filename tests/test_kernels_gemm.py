@@ -80,9 +80,16 @@ def test_an_emulated_processor_is_not_trusted(monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="names a processor of x86")
-def test_smaller_tiles_give_the_same(tmp_path):
-    """As on a processor with 16 registers of 4 float32: compiled in a process of its own."""
+@pytest.mark.parametrize("unit", ["nehalem", "vectors"])
+def test_smaller_tiles_give_the_same(tmp_path, unit):
+    """As on a processor with 16 registers of 4 float32, or without a matrix unit: compiled in a process of its own."""
+    if unit == "vectors" and not gemm_tile.BF16.matrix_unit:
+        pytest.skip("without a matrix unit, vectors are what the other tests have")
     text = """
+        from llvmlite import binding
+        features = binding.get_host_cpu_features()
+        features["amx-bf16"] = False
+        binding.get_host_cpu_features = lambda: features
         import torch
         from gridreg.ops import Block, encoded_mlp
         from gridreg.ops.cpu.mlp.gemm_tile import BF16, F32
@@ -91,7 +98,7 @@ def test_smaller_tiles_give_the_same(tmp_path):
         def draw(*shape, seed=0):
             return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
 
-        assert F32.rows == BF16.rows == 4
+        assert F32.rows == BF16.rows == ROWS
         x = draw(77, 9).requires_grad_()
         layers = [Layer(draw(40, 45, seed=1) / 7, draw(40, seed=2)), Layer(draw(5, 40, seed=3) / 6, None)]
         layers = [Layer(w.requires_grad_(), b if b is None else b.requires_grad_()) for w, b in layers]
@@ -105,10 +112,11 @@ def test_smaller_tiles_give_the_same(tmp_path):
             for a, b in zip(found, expected):
                 assert float((a - b).norm() / b.norm()) < bound, precision
     """
-    small = {"NUMBA_CPU_NAME": "nehalem", "NUMBA_CPU_FEATURES": "+sse4.2", "NUMBA_CACHE_DIR": str(tmp_path)}
+    small = {"NUMBA_CPU_NAME": "nehalem", "NUMBA_CPU_FEATURES": "+sse4.2"} if unit == "nehalem" else {}
+    text = textwrap.dedent(text).replace("ROWS", "4" if small else "8")
     done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(text)],
-        env={**os.environ, **small, "GRIDREG_COMPILE_AHEAD": "0"},
+        [sys.executable, "-c", text],
+        env={**os.environ, **small, "NUMBA_CACHE_DIR": str(tmp_path), "GRIDREG_COMPILE_AHEAD": "0"},
         capture_output=True,
         text=True,
         timeout=300,

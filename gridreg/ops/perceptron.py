@@ -20,7 +20,7 @@ from gridreg.errors import InputError
 from gridreg.ops.dispatch import operation
 
 Precision: TypeAlias = Literal["float32", "bfloat16", "auto"]
-"""Of products: "auto" is bfloat16 on processors that multiply it (AVX-512 BF16), float32 on others."""
+"""Of products: "auto" is bfloat16 on processors that multiply it (AVX-512 BF16, AMX), float32 on others."""
 
 _PRECISIONS = ("float32", "bfloat16", "auto")
 

@@ -10,6 +10,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from gridreg.ops.cpu.mlp.gemm_amx import allowed
+
 try:
     import fcntl
 except ImportError:  # Windows has no such lock.
@@ -39,11 +41,12 @@ def one_process(folder: str, name: str) -> Iterator[None]:
 
 @functools.cache
 def _sources() -> tuple[tuple[str, ...], str]:
-    """Names of the modules of `gridreg.ops` and the digest of what they say."""
+    """Names of the modules of `gridreg.ops` and the digest of what they say, and of what they ask the system."""
     files = sorted(Path(__file__).parents[2].rglob("*.py"))
     digest = hashlib.sha256()
     for file in files:
         digest.update(file.read_bytes())
+    digest.update(bytes([allowed()]))
     return tuple(file.stem for file in files), digest.hexdigest()
 
 

@@ -12,6 +12,7 @@ from torch.nn import functional as F
 
 from gridreg.ops.cpu.jit.compiler import inline
 from gridreg.ops.cpu.jit.table import intrinsic
+from gridreg.ops.cpu.mlp.gemm_amx import EDGE, configure_tiles, transpose_words
 from gridreg.ops.cpu.mlp.gemm_tile import (
     BF16,
     COLUMNS,
@@ -35,6 +36,7 @@ TASKS = 16
 TILE_ROWS = max(F32.rows, BF16.rows)
 """Rows of the highest tile: products read and write whole tiles."""
 
+_MATRIX_UNIT = BF16.matrix_unit
 # Pairs of the rows of a sum.
 PAIRS = GRADIENT_ROWS // 2 * WIDEST
 _HALVES, _WORDS = ir.VectorType(ir.IntType(16), 16), ir.VectorType(ir.IntType(32), 16)
@@ -42,8 +44,9 @@ _HALVES, _WORDS = ir.VectorType(ir.IntType(16), 16), ir.VectorType(ir.IntType(32
 
 def _product(arithmetic: Arithmetic, epilogue: Epilogue) -> Any:
     """A product of rows with a packed weight, as a function for kernels."""
-    wide, narrow = (register_tile(arithmetic, vectors, epilogue) for vectors in (2, 1))
-    height, two, by_column = arithmetic.rows, arithmetic.wide, int(epilogue != "relu_mask")
+    wide, narrow = (register_tile(arithmetic, n, epilogue) for n in (arithmetic.wide, 1))
+    height, by_column = arithmetic.rows, int(epilogue != "relu_mask")
+    across = COLUMNS * arithmetic.wide
 
     @inline
     def product(
@@ -52,8 +55,8 @@ def _product(arithmetic: Arithmetic, epilogue: Epilogue) -> Any:
     ) -> None:  # fmt: skip
         """Write ``rows`` rows of ``columns``; see `TileArguments`. The weight is what `pack` returns."""
         panel = steps * COLUMNS
-        split = columns - columns % (2 * COLUMNS) if two else 0
-        for i in range(0, split, 2 * COLUMNS):
+        split = columns - columns % across if across > COLUMNS else 0
+        for i in range(0, split, across):
             for r in range(0, rows, height):
                 wide(
                     left, left_start + r * left_row, left_row, 1, weight, i * steps, COLUMNS, panel, steps,
@@ -76,27 +79,27 @@ relu_mask_f32, relu_mask_bf16 = _product(F32, "relu_mask"), _product(BF16, "relu
 
 def _sum_of_products(arithmetic: Arithmetic) -> Any:
     """Sums over rows of products of two matrices' columns, as a function for kernels."""
-    wide, narrow = (register_tile(arithmetic, vectors, "accumulate") for vectors in (2, 1))
-    height, two = arithmetic.rows, arithmetic.wide
+    wide, narrow = (register_tile(arithmetic, n, "accumulate") for n in (arithmetic.wide, 1))
+    height, across = arithmetic.rows, COLUMNS * arithmetic.wide
 
     @inline
     def sum_of_products(
-        left: Any, left_width: int, right: Any, right_start: int, right_step: int, right_panel: int,
-        between: int, width: int, steps: int, sums: Any, sums_start: int,
+        left: Any, left_width: int, left_column: int, left_row: int, left_step: int, right: Any, right_start: int,
+        right_step: int, right_panel: int, width: int, steps: int, sums: Any, sums_start: int,
     ) -> None:  # fmt: skip
-        """Add to ``sums (left_width, width)``; blocks of 16 columns of right are ``between`` words apart."""
-        split = width - width % (2 * COLUMNS) if two else 0
+        """Add to ``sums (left_width, width)``; columns of left are ``left_column`` words apart, tile by tile."""
+        split = width - width % across if across > COLUMNS else 0
         for n in range(0, left_width, height):
-            to = sums_start + n * width
-            for k in range(0, split, 2 * COLUMNS):
+            first, to = n * left_column, sums_start + n * width
+            for k in range(0, split, across):
                 wide(
-                    left, n, 1, left_width, right, right_start + k // COLUMNS * between, right_step, right_panel,
-                    steps, sums, to + k, width, sums, 0,
+                    left, first, left_row, left_step, right, right_start + k // COLUMNS * right_panel, right_step,
+                    right_panel, steps, sums, to + k, width, sums, 0,
                 )  # fmt: skip
             for k in range(split, width, COLUMNS):
                 narrow(
-                    left, n, 1, left_width, right, right_start + k // COLUMNS * between, right_step, right_panel,
-                    steps, sums, to + k, width, sums, 0,
+                    left, first, left_row, left_step, right, right_start + k // COLUMNS * right_panel, right_step,
+                    right_panel, steps, sums, to + k, width, sums, 0,
                 )  # fmt: skip
 
     return sum_of_products
@@ -117,20 +120,44 @@ def add_weight_gradient_f32(
         x: its rows from ``first`` on, ``width`` wide.
         slope_pairs, x_pairs: not used.
     """
-    _sum_f32(slope, slope_width, x, first * width, width, COLUMNS, COLUMNS, width, rows, sums, start)
+    _sum_f32(
+        slope, slope_width, 1, 1, slope_width, x, first * width, width, COLUMNS, width, rows, sums, start
+    )
 
 
 @inline
-def add_weight_gradient_bf16(
+def _add_by_vectors(
     slope: Any, slope_width: int, x: Any, width: int, first: int, rows: int, sums: Any, start: int,
     slope_pairs: Any, x_pairs: Any,
 ) -> None:  # fmt: skip
-    """`add_weight_gradient_f32` in bfloat16; ``slope_pairs`` and ``x_pairs`` are memory for `PAIRS` pairs."""
     pairs = -(-rows // 2)
     _pair_rows(slope, slope_width, 0, rows, slope_pairs, COLUMNS, slope_width)
     _pair_rows(x, width, first, rows, x_pairs, COLUMNS * pairs, COLUMNS)
+    _sum_bf16(
+        slope_pairs, slope_width, 1, 1, slope_width, x_pairs, 0, COLUMNS, COLUMNS * pairs, width, pairs, sums, start
+    )  # fmt: skip
+
+
+@inline
+def _add_by_matrices(
+    slope: Any, slope_width: int, x: Any, width: int, first: int, rows: int, sums: Any, start: int,
+    slope_pairs: Any, x_pairs: Any,
+) -> None:  # fmt: skip
+    pairs = -(-rows // (2 * EDGE)) * EDGE
     panel = COLUMNS * pairs
-    _sum_bf16(slope_pairs, slope_width, x_pairs, 0, COLUMNS, panel, panel, width, pairs, sums, start)
+    for i in range(0, panel * max(slope_width, width) // COLUMNS if 2 * pairs > rows else 0):
+        slope_pairs[i], x_pairs[i] = 0, 0
+    _pair_rows(slope, slope_width, 0, rows, slope_pairs, panel, COLUMNS)
+    _pair_rows(x, width, first, rows, x_pairs, panel, COLUMNS)
+    for i in range(0, slope_width * pairs, EDGE * EDGE):
+        transpose_words(slope_pairs, i)
+    _sum_bf16(
+        slope_pairs, slope_width, pairs, EDGE, EDGE, x_pairs, 0, COLUMNS, panel, width, pairs, sums, start
+    )  # fmt: skip
+
+
+add_weight_gradient_bf16 = _add_by_matrices if BF16.matrix_unit else _add_by_vectors
+"""`add_weight_gradient_f32` in bfloat16; ``slope_pairs`` and ``x_pairs`` are memory for `PAIRS` pairs."""
 
 
 @intrinsic
@@ -165,6 +192,18 @@ def round_to_bf16(context: Any, array: Any, index: Any, value: Any) -> Any:
         return context.get_dummy_value()
 
     return types.void(array, index, value), generate
+
+
+@inline
+def prepare_bf16() -> None:
+    """Before the products of a task in bfloat16."""
+    if _MATRIX_UNIT:
+        configure_tiles()
+
+
+@inline
+def prepare_f32() -> None:
+    """Before the products of a task in float32: nothing."""
 
 
 @inline

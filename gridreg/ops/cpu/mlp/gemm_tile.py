@@ -3,7 +3,8 @@
 A tile has some rows and 16 or 32 columns; how many follows from the registers that the processor has. Each
 step of its sum takes one number of every row, in float32, or a pair of numbers, in bfloat16, whose products
 are summed in float32: by one instruction where the processor has it (AVX-512 BF16), else by two
-multiply-adds. At its end stands an epilogue: what a layer does with the sum before it is written.
+multiply-adds; or in the processor's matrix unit (`gridreg.ops.cpu.mlp.gemm_amx`). At its end stands an
+epilogue: what a layer does with the sum before it is written.
 
 It is generated because numba's own loops do not keep a block of results in registers: they take several times
 as long.
@@ -13,7 +14,7 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 from llvmlite import binding, ir  # type: ignore[import-untyped]
@@ -22,6 +23,7 @@ from numba.core import cgutils
 
 from gridreg.ops.cpu.jit.simd import bf16_bits
 from gridreg.ops.cpu.jit.table import intrinsic
+from gridreg.ops.cpu.mlp import gemm_amx
 
 COLUMNS = 16
 """Columns of a vector of results."""
@@ -68,17 +70,19 @@ class Arithmetic(NamedTuple):
         word: LLVM type of what a row gives to a step.
         per_word: numbers in it.
         rows: of a tile.
-        wide: whether there are registers for 32 columns.
+        wide: vectors of 16 columns for which there are registers.
         operand: a vector of words to what `multiply_add` takes.
         multiply_add: a sum and two operands to the sum after the step.
+        matrix_unit: whether `gridreg.ops.cpu.mlp.gemm_amx` sums up, instead of these two.
     """
 
     word: Any
     per_word: int
     rows: int
-    wide: bool
+    wide: int
     operand: Callable[[Any, Any], Any]
     multiply_add: Callable[[Any, Any, Any, Any], Any]
+    matrix_unit: bool = False
 
 
 def _float_step(builder: Any, total: Any, left: Any, right: Any) -> Any:
@@ -110,11 +114,14 @@ def _portable_step(builder: Any, total: Any, left: Any, right: Any) -> Any:
 
 _NATIVE = has("avx512bf16")
 # 16 registers of results of 32 (AVX-512), or 8 of 16.
-_ROWS, _WIDE = (8, True) if has("avx512f") else (4, False)
+_ROWS, _WIDE = (8, 2) if has("avx512f") else (4, 1)
+_MATRIX_UNIT = _NATIVE and has("amx-bf16") and gemm_amx.allowed()
 
 F32 = Arithmetic(ir.FloatType(), 1, _ROWS, _WIDE, lambda builder, words: words, _float_step)
 BF16 = (
-    Arithmetic(_WORD, 2, 8, True, _native_pairs, _native_step)
+    Arithmetic(_WORD, 2, gemm_amx.EDGE, 4, _native_pairs, _native_step, True)
+    if _MATRIX_UNIT
+    else Arithmetic(_WORD, 2, 8, 2, _native_pairs, _native_step)
     if _NATIVE
     else Arithmetic(_WORD, 2, _ROWS, _WIDE, _portable_pairs, _portable_step)
 )
@@ -142,38 +149,6 @@ def _broadcast(builder: Any, value: Any) -> Any:
     undefined = ir.Constant(kind, ir.Undefined)
     first = builder.insert_element(undefined, value, _WORD(0))
     return builder.shuffle_vector(first, undefined, ir.Constant(_WORDS, [0] * COLUMNS))
-
-
-def _loop(
-    builder: Any, before: Sequence[Any], count: Any, step: Callable[[Any, Sequence[Any]], Sequence[Any]]
-) -> list[Any]:
-    """A loop over sums; the builder stands behind it then.
-
-    Args:
-        builder: where it begins.
-        before: the sums at first.
-        count: of turns, int64.
-        step: the number of a turn and the sums before it to the sums after it.
-    """
-    entry = builder.block
-    head, body, end = (builder.append_basic_block(name) for name in ("turns", "turn", "done"))
-    builder.branch(head)
-    builder.position_at_end(head)
-    number = builder.phi(_INDEX)
-    number.add_incoming(_INDEX(0), entry)
-    sums = []
-    for value in before:
-        sums.append(builder.phi(_FLOATS))
-        sums[-1].add_incoming(value, entry)
-    builder.cbranch(builder.icmp_signed("<", number, count), body, end)
-    builder.position_at_end(body)
-    after = step(number, sums)
-    number.add_incoming(builder.add(number, _INDEX(1)), body)
-    for total, value in zip(sums, after, strict=True):
-        total.add_incoming(value, body)
-    builder.branch(head)
-    builder.position_at_end(end)
-    return sums
 
 
 class TileArguments(NamedTuple):
@@ -207,6 +182,32 @@ class TileArguments(NamedTuple):
     argument_start: Any
 
 
+def _sum_registers(
+    arithmetic: Arithmetic, builder: Any, at: TileArguments, left: Any, right: Any, vectors: int, before: Any
+) -> list[Any]:
+    """The sums of a tile, row by row, beginning with the vectors ``before``."""
+    words = ir.VectorType(arithmetic.word, COLUMNS)
+
+    def step(number: Any, sums: Sequence[Any]) -> list[Any]:
+        first = builder.add(at.right_start, builder.mul(number, at.right_step))
+        factors = []
+        for v in range(vectors):
+            place = builder.add(first, builder.mul(at.right_panel, _INDEX(v)))
+            vector = builder.load(element(builder, right, place, words), align=4)
+            factors.append(arithmetic.operand(builder, vector))
+        start = builder.add(at.left_start, builder.mul(number, at.left_step))
+        after: list[Any] = []
+        for row in range(arithmetic.rows):
+            place = builder.add(start, builder.mul(at.left_row, _INDEX(row)))
+            one = _broadcast(builder, builder.load(builder.gep(left, [place])))
+            one = arithmetic.operand(builder, one)
+            for factor in factors:
+                after.append(arithmetic.multiply_add(builder, sums[len(after)], one, factor))
+        return after
+
+    return gemm_amx.loop(builder, before, at.steps, step)
+
+
 def register_tile(arithmetic: Arithmetic, vectors: int, epilogue: Epilogue) -> Any:
     """An intrinsic for a tile of 16 columns for each of ``vectors``; it takes `TileArguments`."""
 
@@ -220,7 +221,6 @@ def register_tile(arithmetic: Arithmetic, vectors: int, epilogue: Epilogue) -> A
                 for name in ("left", "right", "out", "argument")
             )
             left, right = (builder.bitcast(x, arithmetic.word.as_pointer()) for x in (left, right))
-            words = ir.VectorType(arithmetic.word, COLUMNS)
             places = [
                 builder.add(
                     builder.add(at.out_start, builder.mul(at.out_row, _INDEX(row))), _INDEX(COLUMNS * v)
@@ -228,29 +228,16 @@ def register_tile(arithmetic: Arithmetic, vectors: int, epilogue: Epilogue) -> A
                 for row in range(arithmetic.rows)
                 for v in range(vectors)
             ]
-            before = [_ZERO] * len(places)
-            if epilogue == "accumulate":
-                before = [builder.load(element(builder, out, place), align=4) for place in places]
-
-            def step(number: Any, sums: Sequence[Any]) -> list[Any]:
-                first = builder.add(at.right_start, builder.mul(number, at.right_step))
-                factors = []
-                for v in range(vectors):
-                    place = builder.add(first, builder.mul(at.right_panel, _INDEX(v)))
-                    vector = builder.load(element(builder, right, place, words), align=4)
-                    factors.append(arithmetic.operand(builder, vector))
-                start = builder.add(at.left_start, builder.mul(number, at.left_step))
-                after: list[Any] = []
-                for row in range(arithmetic.rows):
-                    place = builder.add(start, builder.mul(at.left_row, _INDEX(row)))
-                    one = _broadcast(builder, builder.load(builder.gep(left, [place])))
-                    one = arithmetic.operand(builder, one)
-                    for factor in factors:
-                        after.append(arithmetic.multiply_add(builder, sums[len(after)], one, factor))
-                return after
-
-            sums = _loop(builder, before, at.steps, step)
-            for number, (place, value) in enumerate(zip(places, sums, strict=True)):
+            sums: Iterable[Any]
+            if arithmetic.matrix_unit:
+                into = out if epilogue == "accumulate" else None
+                sums = gemm_amx.sum_tiles(builder, at, left, right, vectors, into)
+            else:
+                before = [_ZERO] * len(places)
+                if epilogue == "accumulate":
+                    before = [builder.load(element(builder, out, place), align=4) for place in places]
+                sums = _sum_registers(arithmetic, builder, at, left, right, vectors, before)
+            for number, (place, value) in enumerate(zip(places, sums, strict=False)):
                 if epilogue in ("bias", "relu"):
                     column = builder.add(at.argument_start, _INDEX(COLUMNS * (number % vectors)))
                     value = builder.fadd(value, builder.load(element(builder, argument, column), align=4))

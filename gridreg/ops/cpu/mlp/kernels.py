@@ -24,6 +24,8 @@ from gridreg.ops.cpu.mlp.gemm import (
     add_weight_gradient_f32,
     bias_bf16,
     bias_f32,
+    prepare_bf16,
+    prepare_f32,
     relu_bf16,
     relu_f32,
     relu_mask_bf16,
@@ -80,10 +82,13 @@ _GRADIENT, _WANTED, _ZEROS, _SUMS, _ENCODED_GRADIENT = range(4, _BACK_AHEAD)
 
 
 @_pasted
-def _forward(table: Any, dtype: Any, packed: Any, per_step: int, write: Any, relu: Any, last: Any) -> None:
+def _forward(
+    table: Any, dtype: Any, packed: Any, per_step: int, write: Any, relu: Any, last: Any, prepare: Any
+) -> None:
     row_count, blocks, depth = integer(table, _ROW_COUNT), integer(table, _BLOCKS), integer(table, _LAYERS)
     encoded, out = vector(table, _ENCODED, dtype), vector(table, _OUT, float32)
     copied = scratch(_FORWARD_TILE, dtype)
+    prepare()
     while True:
         task = next_task(table)
         if task < 0:
@@ -112,7 +117,14 @@ def _forward(table: Any, dtype: Any, packed: Any, per_step: int, write: Any, rel
 
 @_pasted
 def _backward(
-    table: Any, dtype: Any, packed: Any, per_step: int, add_weight_gradient: Any, relu_mask: Any, last: Any
+    table: Any,
+    dtype: Any,
+    packed: Any,
+    per_step: int,
+    add_weight_gradient: Any,
+    relu_mask: Any,
+    last: Any,
+    prepare: Any,
 ) -> None:
     row_count, blocks, depth = integer(table, _ROW_COUNT), integer(table, _BLOCKS), integer(table, _LAYERS)
     encoded, encoded_width = vector(table, _ENCODED, dtype), size(table, _ENCODED, 1)
@@ -123,6 +135,7 @@ def _backward(
     layers = _BACK_AHEAD + PER_BLOCK * blocks
     these, those = scratch(_TILE, dtype), scratch(_TILE, dtype)
     slope_pairs, x_pairs = scratch(PAIRS, int32), scratch(PAIRS, int32)
+    prepare()
     while True:
         task = next_task(table)
         if task < 0:
@@ -159,22 +172,22 @@ def _backward(
 @kernel
 def forward_f32(table: Any) -> None:
     """`ForwardArguments`, in float32."""
-    _forward(table, float32, float32, 1, store, relu_f32, bias_f32)
+    _forward(table, float32, float32, 1, store, relu_f32, bias_f32, prepare_f32)
 
 
 @kernel
 def forward_bf16(table: Any) -> None:
     """`ForwardArguments`, in bfloat16."""
-    _forward(table, uint16, int32, 2, round_to_bf16, relu_bf16, bias_bf16)
+    _forward(table, uint16, int32, 2, round_to_bf16, relu_bf16, bias_bf16, prepare_bf16)
 
 
 @kernel
 def backward_f32(table: Any) -> None:
     """`BackwardArguments`, in float32."""
-    _backward(table, float32, float32, 1, add_weight_gradient_f32, relu_mask_f32, bias_f32)
+    _backward(table, float32, float32, 1, add_weight_gradient_f32, relu_mask_f32, bias_f32, prepare_f32)
 
 
 @kernel
 def backward_bf16(table: Any) -> None:
     """`BackwardArguments`, in bfloat16."""
-    _backward(table, uint16, int32, 2, add_weight_gradient_bf16, relu_mask_bf16, bias_bf16)
+    _backward(table, uint16, int32, 2, add_weight_gradient_bf16, relu_mask_bf16, bias_bf16, prepare_bf16)
