@@ -12,8 +12,10 @@ import numpy as np
 import torch
 
 from gridreg.ablation.records import RunResult, RunSpec, Study
+from gridreg.rendering import Rendered
 from gridreg.training.curves import History
-from gridreg.training.outputs import save_view
+from gridreg.training.evaluate import Scored
+from gridreg.training.outputs import save_scored
 from gridreg.training.record import metrics_record
 
 NASTY = "masks <b>\"bold\"</b> & 'co' | $x_1$ \\ {y}"
@@ -113,7 +115,8 @@ def write_files(result: RunResult, size: int = 48) -> None:
         shade = (
             torch.tensor([0.1, 0.5, 0.9]) if result.spec.label == "tensorf" else torch.tensor([0.8, 0.4, 0.2])
         )
-        save_view(views, name, torch.where(disc, shade, torch.tensor(1.0)), target)
+        image = torch.where(disc, shade, torch.tensor(1.0))
+        save_scored(views, Scored(name, Rendered(image, image[..., 0], image[..., 0]), target, {}))
     final = result.metrics["mean"]["psnr"] if result.metrics else 0.0
     save_history(result.folder / "history.jsonl", final, masked=result.spec.label not in ("tensorf", "none"))
 

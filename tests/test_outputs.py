@@ -12,8 +12,10 @@ import torch
 from torch import Tensor
 
 from gridreg.errors import InputError
+from gridreg.rendering import Rendered
 from gridreg.training import images as image_arrays
 from gridreg.training import outputs
+from gridreg.training.evaluate import Scored
 
 
 def inferno(share: np.ndarray) -> np.ndarray:
@@ -54,7 +56,7 @@ def test_error_map_ends(pair):
 def test_comparison_holds_target_render_and_error_in_this_order():
     generator = torch.Generator().manual_seed(1)
     image, target = torch.rand(2, 220, 210, 3, generator=generator)
-    picture = outputs.comparison(image, target, metrics={"psnr": 20.123, "ssim_gaussian": 0.5})
+    picture = outputs.comparison(image, target, {"psnr": 20.123, "ssim_gaussian": 0.5})
     body = picture[-220:]
     assert np.array_equal(body[:, :210], image_arrays.to_uint8(target))
     assert np.array_equal(body[:, 214:424], image_arrays.to_uint8(image))
@@ -67,7 +69,7 @@ def test_comparison_holds_target_render_and_error_in_this_order():
 
 def test_small_images_are_enlarged_by_whole_pixels(pair):
     image, target = pair
-    picture = outputs.comparison(image, target)
+    picture = outputs.comparison(image, target, {})
     body = picture[-150:]
     assert np.array_equal(body[:, :200], image_arrays.to_uint8(target).repeat(5, 0).repeat(5, 1))
 
@@ -130,15 +132,17 @@ def test_depth_of_nothing_and_of_a_flat_wall(opacity):
     assert white == (opacity != 1.0)
 
 
-def test_save_view_writes_three_pictures(tmp_path, pair):
+def scored(image: Tensor, target: Tensor, psnr: float = 20.0, name: str = "r_0") -> Scored:
+    depth = torch.ones(image.shape[:2])
+    return Scored(name, Rendered(image, depth, depth), target, {"psnr": psnr})
+
+
+def test_a_scored_view_is_three_pictures(tmp_path, pair):
+    outputs.save_scored(tmp_path, scored(*pair, psnr=math.inf))
     image, target = pair
-    depth = torch.ones(30, 40)
-    outputs.save_view(tmp_path, "r_0", image, target, depth=depth, opacity=depth, metrics={"psnr": math.inf})
     assert sorted(p.name for p in tmp_path.iterdir()) == ["r_0.png", "r_0_compare.png", "r_0_depth.png"]
     assert np.array_equal(iio.imread(tmp_path / "r_0.png"), image_arrays.to_uint8(image))
     assert np.array_equal(iio.imread(tmp_path / "r_0_compare.png")[-150:, :200], picture_of(target))
-    outputs.save_view(tmp_path, "r_8", image, target)
-    assert not (tmp_path / "r_8_depth.png").exists()
 
 
 def picture_of(image: Tensor) -> np.ndarray:
@@ -149,32 +153,25 @@ def picture_of(image: Tensor) -> np.ndarray:
 def test_contact_sheet_holds_every_pair(tmp_path, count):
     images = [torch.full((20, 20, 3), (i + 1) / 10) for i in range(count)]
     targets = [torch.full((20, 20, 3), (i + 1) / 20) for i in range(count)]
-    names = [f"r_{i}" for i in range(count)]
     path = tmp_path / "sheet.png"
-    outputs.save_contact_sheet(path, names, images, targets, psnrs=[20.0] * count, columns=3, size=40)
+    outputs.save_contact_sheet(path, [scored(*pair) for pair in zip(images, targets, strict=True)])
     sheet = iio.imread(path)
     for index in range(count):
-        line, column = divmod(index, 3)
-        y, x = line * (40 + 20 + 8) + 20 + 20, column * (81 + 8) + 20
+        line, column = divmod(index, 5)
+        y, x = line * (160 + 20 + 8) + 20 + 20, column * (321 + 8) + 20
         assert (sheet[y, x] == image_arrays.to_uint8(targets[index])[0, 0]).all()
-        assert (sheet[y, x + 41] == image_arrays.to_uint8(images[index])[0, 0]).all()
-
-
-@pytest.mark.parametrize("names", [[], ["a", "b"]])
-def test_contact_sheet_of_nothing_or_of_unequal_numbers(tmp_path, names):
-    with pytest.raises(InputError, match="expected as many of each"):
-        outputs.save_contact_sheet(tmp_path / "sheet.png", names, [], [])
+        assert (sheet[y, x + 161] == image_arrays.to_uint8(images[index])[0, 0]).all()
 
 
 def test_shapes_that_do_not_fit(pair):
     image, target = pair
     with pytest.raises(InputError, match="expected equal shapes"):
-        outputs.comparison(image[:-1], target)
+        outputs.comparison(image[:-1], target, {})
     with pytest.raises(InputError, match=r"expected \(H, W\) both"):
         outputs.depth_image(torch.zeros(3, 3), torch.zeros(3, 4))
 
 
 def test_an_unwritable_place_is_one_line(tmp_path, pair):
     with pytest.raises(InputError, match=r"none/r_0\.png: cannot write here") as caught:
-        outputs.save_view(tmp_path / "none", "r_0", *pair)
+        outputs.save_scored(tmp_path / "none", scored(*pair))
     assert "\n" not in str(caught.value)

@@ -12,8 +12,9 @@ import torch
 from torch import Tensor
 
 from gridreg.errors import InputError
+from gridreg.training.files import write_json
 from gridreg.training.metrics import image_metrics
-from gridreg.training.record import metrics_record, save_metrics, summary
+from gridreg.training.record import metrics_record, summary
 from gridreg.training.versions import cpu_model, package_version, versions
 
 
@@ -41,7 +42,7 @@ def record(pair: tuple[Tensor, Tensor], **changes: object) -> dict[str, object]:
 
 
 def test_metrics_record_says_all_it_takes_to_judge_it(tmp_path, pair):
-    save_metrics(tmp_path / "metrics.json", record(pair, carved=True))
+    write_json(tmp_path / "metrics.json", record(pair, carved=True))
     saved = json.loads((tmp_path / "metrics.json").read_text())
     assert list(saved) == sorted(saved)
     assert saved["benchmark"] is True

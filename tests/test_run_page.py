@@ -17,9 +17,11 @@ import trimesh
 from gridreg.errors import InputError
 from gridreg.export import Mesh, save_mesh, write_page
 from gridreg.export import page as page_module
+from gridreg.rendering import Rendered
 from gridreg.scenes import Scene, Views, World
+from gridreg.training.evaluate import Scored
 from gridreg.training.files import write_json
-from gridreg.training.outputs import save_view
+from gridreg.training.outputs import save_scored
 from tests.chromium import open_page
 from tests.export_fields import ring_of_views
 
@@ -61,7 +63,8 @@ def folder(tmp_path: Path) -> Path:
     for name, value in (("r_2", 0.25), ("r_10", 0.5)):
         image, target = torch.full((30, 40, 3), value), torch.full((30, 40, 3), value / 2)
         scores[name] = {"psnr": 20 + value, "ssim_gaussian": value}
-        save_view(tmp_path / "test", name, image, target, metrics=scores[name])
+        rendered = Rendered(image, image[..., 0], image[..., 0])
+        save_scored(tmp_path / "test", Scored(name, rendered, target, scores[name]))
     record = {"scene": NAME, "mean": {"psnr": 20.375, "ssim_gaussian": 0.375}, "images": scores}
     more = {
         "test_views": 2,

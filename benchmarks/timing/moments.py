@@ -32,7 +32,7 @@ _STAGES = {
         ("save_contact_sheet", "contact sheet"),
         ("draw_curves", "curves"),
         ("draw_masks", "masks"),
-        ("save_metrics", "metrics"),
+        ("write_json", "metrics"),
     ],
     "gridreg.training.events": [
         ("OccupiedSpace.update", "occupancy"),

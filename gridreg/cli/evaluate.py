@@ -52,11 +52,11 @@ def _score(options: EvalOptions) -> int:
     from gridreg.training import load_run
     from gridreg.training.evaluate import Scored, score_views
     from gridreg.training.exposure import AFFINE_CONVENTION, affine_psnr
-    from gridreg.training.files import check_output_folder
+    from gridreg.training.files import check_output_folder, write_json
     from gridreg.training.metrics import image_metrics
     from gridreg.training.outputs import save_contact_sheet, save_scored
     from gridreg.training.perceptual import read_lpips
-    from gridreg.training.record import metrics_record, save_metrics, summary
+    from gridreg.training.record import metrics_record, summary
     from gridreg.training.typed_data import to_data
 
     lpips = None if options.lpips is None else read_lpips(options.lpips)
@@ -95,14 +95,8 @@ def _score(options: EvalOptions) -> int:
         **_members(loaded),
     )
     if options.out is not None:
-        save_metrics(options.out / "metrics.json", record)
-        save_contact_sheet(
-            options.out / "test.png",
-            [view.name for view in scored],
-            [view.rendered.colour for view in scored],
-            [view.target for view in scored],
-            psnrs=[view.metrics["psnr"] for view in scored],
-        )
+        write_json(options.out / "metrics.json", record)
+        save_contact_sheet(options.out / "test.png", scored)
     print(summary(record), flush=True)
     if options.out is not None:
         write_page(options.out, scene, run=folder_of(options.checkpoint), model=loaded)

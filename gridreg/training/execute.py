@@ -21,11 +21,11 @@ from gridreg.training.config import save_yaml
 from gridreg.training.curves import History, draw_curves, draw_masks
 from gridreg.training.evaluate import Scored, mean_psnr_of, score_views
 from gridreg.training.exposure import AFFINE_CONVENTION, affine_psnr
-from gridreg.training.files import check_output_folder, one_writer
+from gridreg.training.files import check_output_folder, one_writer, write_json
 from gridreg.training.metrics import image_metrics
 from gridreg.training.outputs import save_contact_sheet, save_scored
 from gridreg.training.progress import Interruption, Progress, compilation_shown, interruptible
-from gridreg.training.record import metrics_record, save_metrics
+from gridreg.training.record import metrics_record
 from gridreg.training.run import build_trainer, resume_trainer, save_run
 from gridreg.training.settings import RunConfig
 from gridreg.training.trainer import StepReport, Trainer
@@ -180,13 +180,7 @@ class Execution:
         """Write ``metrics.json``, the contact sheet and the curves; return the metrics."""
         scene = self.scene
         title = f"{scene.name}, {scene.protocol}, {self.config.preset or 'own configuration'}"
-        save_contact_sheet(
-            self.out / "test.png",
-            [view.name for view in scored],
-            [view.rendered.colour for view in scored],
-            [view.target for view in scored],
-            psnrs=[view.metrics["psnr"] for view in scored],
-        )
+        save_contact_sheet(self.out / "test.png", scored)
         self.history.save(self.out / "history.jsonl")
         draw_curves(
             self.history.rows, self.out / "curves.png", title=title, events=self.config.train.resample_at
@@ -208,7 +202,7 @@ class Execution:
             uses_alpha=self.config.train.carve and scene.train.backdrop is None,
             device=str(self.trainer.bank.pixels.device),
         )
-        save_metrics(self.out / "metrics.json", metrics)
+        write_json(self.out / "metrics.json", metrics)
         return metrics
 
 

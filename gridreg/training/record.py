@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from gridreg.training.files import write_json
 from gridreg.training.metrics import json_ready, mean_metrics
 from gridreg.training.versions import versions
 
@@ -75,15 +73,6 @@ def metrics_record(
     }
     ready: dict[str, Any] = json_ready(record)
     return ready
-
-
-def save_metrics(path: str | os.PathLike[str], record: Mapping[str, Any]) -> None:
-    """Write ``metrics_record`` as JSON with sorted keys, whole or not at all.
-
-    Raises:
-        InputError: if the place is not writable or the disk is full.
-    """
-    write_json(path, record)
 
 
 def summary(record: Mapping[str, Any]) -> str:
