@@ -125,7 +125,7 @@ def test_an_unforeseen_error_is_kept_with_its_traceback(store, monkeypatch):
     monkeypatch.setattr(performing, "execute", broken)
     study = tiny_study(rows="[none]")
     store.add(study)
-    (claim_folder,) = [store.run_folder(h) for h in study.hashes]
+    (claim_folder,) = [store.run_folder(h) for h in {run.hash for run in study.runs}]
     claim_folder.mkdir(parents=True)
     InProcess().run(store, study, lambda event: None)
     (result,) = store.results(study)
@@ -241,7 +241,7 @@ def test_a_full_disk_pauses_the_study(store, monkeypatch, expected):
     assert store.counts()["waiting"] == 2
     monkeypatch.undo()
     InProcess().run(store, study, events.append)
-    assert images(store) == {h: expected[h] for h in study.hashes}
+    assert images(store) == {h: expected[h] for h in {run.hash for run in study.runs}}
 
 
 def test_a_full_disk_pauses_processes(store, monkeypatch):

@@ -167,7 +167,7 @@ def test_rows_and_runs(path: Path) -> None:
     assert study.baseline in study.labels
     assert study.title != study.name == path.stem
     # Every row is another run, and every row has the same number of them.
-    assert len(set(study.hashes)) == len(study.runs)
+    assert len({run.hash for run in study.runs}) == len(study.runs)
     assert len({len([run for run in study.runs if run.label == label]) for label in study.labels}) == 1
 
 

@@ -37,12 +37,7 @@ class Processes:
     """Runs in ``workers`` processes of ``threads`` threads each.
 
     A process that dies is replaced, and its run goes to another one. The processes end with this one, however it ends.
-
-    Args:
-        workers: processes; default: as many as the cores hold.
-        threads: of each.
-        keep_checkpoints: leave those of finished runs in their folders.
-        device: where they compute.
+    Arguments: as the options of `gridreg ablate`.
     """
 
     workers: int | None = None

@@ -30,14 +30,8 @@ class RayRunner:
     A run whose worker or node is lost goes to another one. What a worker computes comes back through this process, so
     nothing but Ray connects the machines; gridreg must be installed on all of them in the same version.
 
-    Args:
-        address: ``auto``, ``HOST:PORT`` or ``ray://HOST:PORT``; None: Ray is started on this machine, and ends with the
-            study.
-        workers: runs at a time; default: as many as the cluster has processors for.
-        threads: of each run.
-        ship_scenes: send views through Ray; otherwise a scene is found at its path, or by its name below the
-            folder that GRIDREG_DATA names on that machine.
-        keep_checkpoints: leave those of finished runs in their folders.
+    Arguments: as the options of `gridreg ablate`. By default there are as many workers as the cluster has processors
+    for, and a scene is found at its path, or by its name below the folder that GRIDREG_DATA names on that machine.
 
     Raises:
         InputError: if Ray is not installed.

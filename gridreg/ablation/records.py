@@ -191,8 +191,3 @@ class Study:
     def labels(self) -> tuple[str, ...]:
         """Labels of the rows, in the order of the study."""
         return tuple(dict.fromkeys(run.label for run in self.runs))
-
-    @property
-    def hashes(self) -> tuple[str, ...]:
-        """Hashes of the runs, each once, in the order of the study."""
-        return tuple(dict.fromkeys(run.hash for run in self.runs))

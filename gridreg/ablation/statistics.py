@@ -124,9 +124,7 @@ def estimate(values: Iterable[float], confidence: float = 0.95) -> Estimate:
     )
 
 
-def paired_differences(
-    values: Mapping[str, Mapping[Cell, float]], baseline: str, confidence: float = 0.95
-) -> dict[str, Difference]:
+def paired_differences(values: Mapping[str, Mapping[Cell, float]], baseline: str) -> dict[str, Difference]:
     """The difference of every composition to the baseline, pair by pair.
 
     Runs without a partner are left out of the difference (they count in plain means). All pairs weigh the same.
@@ -134,7 +132,6 @@ def paired_differences(
     Args:
         values: a figure by composition and cell.
         baseline: the composition that is subtracted.
-        confidence: of the intervals.
 
     Returns:
         By composition, the baseline left out.
@@ -157,7 +154,7 @@ def paired_differences(
         if label != baseline:
             shared = sorted(cell for cell in cells if cell in reference)
             pairs = {cell: cells[cell] - reference[cell] for cell in shared}
-            found = estimate(pairs.values(), confidence) if pairs else None
+            found = estimate(pairs.values()) if pairs else None
             differences[label] = Difference(pairs, found, _p_value(list(pairs.values())))
     return differences
 

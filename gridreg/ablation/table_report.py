@@ -8,7 +8,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import tyro
 
@@ -38,13 +38,8 @@ class ReportOptions:
     """Title of the report; default: the name of the table."""
 
 
-@dataclass(frozen=True)
-class TableResults:
-    """Results as a report asks for them.
-
-    Args:
-        found: in the order of the table.
-    """
+class TableResults(NamedTuple):
+    """Results as a report asks for them, in the order of the table."""
 
     found: list[RunResult]
 
