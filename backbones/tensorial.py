@@ -207,11 +207,6 @@ class TensorialField(nn.Module):
         features = self.basis(mean(self._components(u).float()))
         return self.decoder(features, directions, mean(2 * u - 1), ray_indices)  # type: ignore[no-any-return]
 
-    def voxel_size(self) -> float:
-        """Mean edge of a cell, world units."""
-        nodes = torch.tensor(self.resolution, device=self.bounds.device)
-        return float(((self.bounds[1] - self.bounds[0]) / (nodes - 1)).mean())
-
     def shrink(self, bounds: Tensor) -> None:
         """Crop to the nodes around a smaller box: inside it the field keeps its values exactly.
 

@@ -24,11 +24,6 @@ PHOTOGRAPHS = Path(__file__).with_name("photographs.md")
 SHEET = "<!-- sheet: begin -->", "<!-- sheet: end -->"
 
 
-def with_front(readme: str, front: str) -> str:
-    """Return README.md with its table renewed, between the marks around it."""
-    return between(readme, f"\n{front}\n", BEGIN, END)
-
-
 def between(page: str, text: str, first: str, last: str) -> str:
     """Return a page with what is between two marks renewed."""
     before, begin, rest = page.partition(first)
@@ -53,7 +48,7 @@ def main(words: Sequence[str] | None = None) -> int:
 
     def texts() -> dict[Path, str]:
         results = Results()
-        readme = with_front(README.read_text(encoding="utf-8"), results.front())
+        readme = between(README.read_text(encoding="utf-8"), f"\n{results.front()}\n", BEGIN, END)
         photographs = between(PHOTOGRAPHS.read_text(encoding="utf-8"), sheet(), *SHEET)
         front = between(readme, results_foreign.sentence(), *FOREIGN)
         page = rendered("results.md", results=results, foreign=results_foreign)

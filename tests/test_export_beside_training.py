@@ -18,6 +18,7 @@ from gridreg.export.viewer import Viewer
 from gridreg.rendering import MarchSettings, OccupancyGrid, Rays, render_rays
 from gridreg.rendering.cameras import Lens
 from gridreg.rendering.model import Model
+from gridreg.training.events import cell_size
 from tests.export_viewing import FakeClient
 
 BOUNDS = torch.tensor([[-1.0] * 3, [1.0] * 3])
@@ -47,7 +48,7 @@ class Run:
 
     @property
     def model(self) -> Model:
-        march = MarchSettings(step=0.5 * self.field.voxel_size())
+        march = MarchSettings(step=0.5 * cell_size(self.field))
         return Model(self.field, OccupancyGrid.full(BOUNDS, (4, 4, 4)), march, torch.ones(3), self.handle)
 
     def iterate(self) -> None:

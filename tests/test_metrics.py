@@ -151,9 +151,9 @@ def test_further_metrics_stand_under_their_names():
 
 def test_numbers_for_json():
     values = [25.0, math.inf, -math.inf, 1e-300]
-    text = json.dumps([metrics.json_number(v) for v in values], allow_nan=False)
+    text = json.dumps(metrics.json_ready(values), allow_nan=False)
     assert [float(v) for v in json.loads(text)] == values
-    assert math.isnan(float(metrics.json_number(math.nan)))
+    assert math.isnan(float(metrics.json_ready(math.nan)))
 
 
 @pytest.mark.parametrize(

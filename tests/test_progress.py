@@ -230,10 +230,8 @@ def test_the_first_signal_asks_and_the_second_aborts(capfd):
     aborted = False
     with interruptible() as interruption:
         assert not interruption.requested
-        assert interruption.exit_status == 0
         os.kill(os.getpid(), signal.SIGINT)
         assert interruption.requested
-        assert interruption.exit_status == 130
         try:
             os.kill(os.getpid(), signal.SIGINT)
             time.sleep(1)
@@ -249,7 +247,6 @@ def test_termination_and_a_closed_terminal_are_requests_as_well(number):
     with interruptible() as interruption:
         os.kill(os.getpid(), number)
         assert interruption.requested
-    assert interruption.exit_status == 128 + number
 
 
 def test_a_closed_terminal_under_nohup_is_none():
@@ -298,7 +295,7 @@ LOOP = textwrap.dedent(
                     time.sleep(30)
                 print("saved", flush=True)
                 break
-    sys.exit(interruption.exit_status)
+    sys.exit(130 if interruption.requested else 0)
     """
 )
 

@@ -158,9 +158,10 @@ def test_the_readme_has_six_rows_with_published_figures(
     assert "| `best` | – |  | – | 30.00 (one seed) |  | 2.0; 2 |" in rows
     assert "| `tensorf` | – | 23.83 | – | – | 23.45 | – |" in rows
     text = f"Before.\n{results.BEGIN}\nold\n{results.END}\nAfter.\n"
-    assert results.with_front(text, front) == f"Before.\n{results.BEGIN}\n{front}\n{results.END}\nAfter.\n"
+    renewed = results.between(text, f"\n{front}\n", results.BEGIN, results.END)
+    assert renewed == f"Before.\n{results.BEGIN}\n{front}\n{results.END}\nAfter.\n"
     with pytest.raises(ValueError, match="found no table between"):
-        results.with_front("Nothing.", front)
+        results.between("Nothing.", front, results.BEGIN, results.END)
 
 
 def test_gains_over_tensorf(tables: ModuleType, tmp_path: Path) -> None:

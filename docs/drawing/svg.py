@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 from numpy.typing import ArrayLike, NDArray
+from skimage.measure import approximate_polygon
 
 WIDTH = 340
 _DOCS = Path(__file__).parents[1]
@@ -92,26 +93,10 @@ def number(value: float) -> str:
     return f"{round(value, 1) + 0.0:g}"
 
 
-def simplified(points: NDArray[np.float64], tolerance: float = 0.06) -> NDArray[np.float64]:
-    """Fewest points of a polyline ``(N, 2)`` that stay within a tolerance of it, pixels (Douglas-Peucker)."""
+def simplified(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Fewest points of a polyline ``(N, 2)`` that stay within 0.06 pixels of it (Douglas-Peucker)."""
     # Two points may be equally far away. Rounded, they are so on every processor, and the first of them is kept.
-    points = points.round(3)
-    keep = np.zeros(len(points), bool)
-    keep[[0, -1]] = True
-    spans = [(0, len(points) - 1)]
-    while spans:
-        first, last = spans.pop()
-        if last - first < 2:
-            continue
-        (start, chord), inner = (points[first], points[last] - points[first]), points[first + 1 : last]
-        # Distance to the segment, not to its line: curves may turn back.
-        along = ((inner - start) @ chord / max(float(chord @ chord), 1e-12)).clip(0, 1)
-        away = np.linalg.norm(inner - start - along[:, None] * chord, axis=1)
-        if away.max() > tolerance:
-            middle = first + 1 + int(away.argmax())
-            keep[middle] = True
-            spans += [(first, middle), (middle, last)]
-    return points[keep]
+    return np.asarray(approximate_polygon(points.round(3), 0.06))
 
 
 class Panel:

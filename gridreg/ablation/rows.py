@@ -18,7 +18,7 @@ Every entry may hold ``preset``, ``backbone``, ``steps`` and ``set`` for its row
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from typing import Any, Literal
@@ -38,16 +38,6 @@ from gridreg.compositions.plain_data import to_config
 from gridreg.errors import ConfigError
 from gridreg.training.strict_yaml import Document
 from gridreg.training.typed_data import from_data
-
-KEYS: dict[str, tuple[str, ...]] = {
-    "name": ("remove", "replace", "add"),
-    "regularizers": (),
-    "leave_one_out": ("parts", "by"),
-    "one_at_a_time": ("on", "parts", "by"),
-    "product": ("parts", "by"),
-    "sweep": ("change", "argument", "key", "values"),
-}
-"""Keys beside the one that tells what an entry is; some are common to all."""
 
 _COMMON = ("label", "preset", "backbone", "steps", "set")
 _EDITS = {"remove": ("-", removed), "replace": ("~", replaced), "add": ("+", added)}
@@ -109,7 +99,7 @@ def expand_rows(entry: Any) -> list[StudyRow]:
             # What a sweep varies stands above what the entry sets.
             set={**read.set, **row.set},
         )
-        for row in _ROWS[read.kind](read)
+        for row in KEYS[read.kind][0](read)
     ]
 
 
@@ -163,7 +153,7 @@ def _read(entry: Any) -> _Entry:
     if len(kinds) != 1:
         found = " and ".join(kinds) or ", ".join(map(str, entry)) or "nothing"
         raise ConfigError((), f"found {found}, expected exactly one of {', '.join(KEYS)}")
-    valid = (kinds[0], *KEYS[kinds[0]], *_COMMON)
+    valid = (kinds[0], *KEYS[kinds[0]][1], *_COMMON)
     for key in entry:
         if key not in valid:
             raise ConfigError((key,), f"found beside {kinds[0]}, expected none but {', '.join(valid)}")
@@ -245,14 +235,15 @@ def _sweep(entry: _Entry) -> list[StudyRow]:
     return [replace(base, label=f"{base.label}, {argument}={v}", plain=own) for v, own in changed]
 
 
-_ROWS = {
-    "name": _named,
-    "regularizers": _written,
-    "leave_one_out": _leave_one_out,
-    "one_at_a_time": _one_at_a_time,
-    "product": _product,
-    "sweep": _sweep,
+KEYS: dict[str, tuple[Callable[[_Entry], list[StudyRow]], tuple[str, ...]]] = {
+    "name": (_named, ("remove", "replace", "add")),
+    "regularizers": (_written, ()),
+    "leave_one_out": (_leave_one_out, ("parts", "by")),
+    "one_at_a_time": (_one_at_a_time, ("on", "parts", "by")),
+    "product": (_product, ("parts", "by")),
+    "sweep": (_sweep, ("change", "argument", "key", "values")),
 }
+"""Rows of each kind of entry, and the keys beside the one that tells the kind; some are common to all."""
 
 
 def _edited(plain: Plain, edits: Mapping[str, Any]) -> Plain:

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import re
-from functools import cache
 from typing import Any
-
-from jinja2 import Environment
 
 from gridreg.export.html import page_environment
 
@@ -27,14 +24,9 @@ def render(template: str, **values: Any) -> str:
         template: name of a file in ``page/``.
         values: by the names that the template uses, all of which must be there.
     """
-    return _environment().get_template(template).render(values)
-
-
-@cache
-def _environment() -> Environment:
     environment = page_environment("gridreg.ablation")
     environment.filters |= {"markdown": _markdown, "latex": _latex}
-    return environment
+    return environment.get_template(template).render(values)
 
 
 def _markdown(text: str) -> str:

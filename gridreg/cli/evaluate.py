@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import sys
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from gridreg.cli.arguments import Checkpoint, OptionalFile, OptionalFolder
 from gridreg.machine import DeviceName, choose_device
-
-if TYPE_CHECKING:
-    from gridreg.training import LoadedRun
 
 
 @dataclass
@@ -39,9 +37,7 @@ def run(options: EvalOptions) -> int:
     """
     from gridreg.training.files import check_output_folder, one_writer
 
-    if options.out is None:
-        return _score(options)
-    with one_writer(check_output_folder(options.out)):
+    with nullcontext() if options.out is None else one_writer(check_output_folder(options.out)):
         return _score(options)
 
 
@@ -77,6 +73,7 @@ def _score(options: EvalOptions) -> int:
     conventions = {} if lpips is None else {lpips.name: lpips.convention}
     if loaded.exposed:
         more, conventions = {"psnr_affine": affine_psnr, **more}, {**AFFINE_CONVENTION, **conventions}
+    members = [{"preset": m.config.preset, "seed": m.config.seed, "steps": m.step} for m in loaded.members]
     scored = score_views(loaded, scene.test, each, partial(image_metrics, more=more))
     record = metrics_record(
         {view.name: view.metrics for view in scored},
@@ -92,7 +89,7 @@ def _score(options: EvalOptions) -> int:
         uses_alpha=scene.train.backdrop is None
         and any(run.config.train.carve for run in loaded.members or (loaded,)),
         conventions=conventions,
-        **_members(loaded),
+        **({"members": members} if members else {}),
     )
     if options.out is not None:
         write_json(options.out / "metrics.json", record)
@@ -101,9 +98,3 @@ def _score(options: EvalOptions) -> int:
     if options.out is not None:
         write_page(options.out, scene, run=folder_of(options.checkpoint), model=loaded)
     return 0
-
-
-def _members(run: LoadedRun) -> dict[str, Any]:
-    """Members of an ensemble; nothing for a single run."""
-    members = [{"preset": m.config.preset, "seed": m.config.seed, "steps": m.step} for m in run.members]
-    return {"members": members} if members else {}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 from collections.abc import Iterable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ _QUALITY = 88
 _STRIP = 20
 
 
+@cache
 def page_environment(package: str) -> Environment:
     """Templates in the folder ``page`` of a package, and behind them those of this one; in HTML, text is escaped."""
     return Environment(

@@ -7,13 +7,11 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jinja2 import Environment
 from markupsafe import Markup
 from PIL import Image
 
@@ -78,7 +76,7 @@ def write_page(
         # As gridreg reconstruct calls every scene.
         name = Path(folder).resolve().name
     text = (
-        _environment()
+        page_environment("gridreg.export")
         .get_template("run.html")
         .render(
             title=name,
@@ -104,11 +102,6 @@ def write_page(
     # Names of files that are not UTF-8 hold lone surrogates, which UTF-8 cannot write.
     write_bytes(path, text.encode("utf-8", "backslashreplace"))
     return path
-
-
-@cache
-def _environment() -> Environment:
-    return page_environment("gridreg.export")
 
 
 def _found(places: Sequence[Path], *names: str) -> Path | None:

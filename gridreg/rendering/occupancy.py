@@ -151,18 +151,13 @@ def _resized(cells: Tensor, old: Tensor, new: Tensor, resolution: tuple[int, int
         last = ((scaled[1:] - 1e-6).ceil().long() - 1).clamp(0, count - 1)
         outside = (scaled[1:] <= 1e-6) | (scaled[:-1] >= count - 1e-6)
         # A running count along the axis answers "any occupied between first and last" in two look-ups.
-        total = F.pad(out.long().cumsum(dim=axis), _pad_front(axis))
+        counted = out.long().cumsum(dim=axis)
+        total = torch.cat([torch.zeros_like(counted.narrow(axis, 0, 1)), counted], dim=axis)
         any_inside = total.index_select(axis, last + 1) - total.index_select(axis, first) > 0
         shape = [1, 1, 1]
         shape[axis] = target
         out = (any_inside & ~outside.view(shape)).to(torch.uint8)
     return out
-
-
-def _pad_front(axis: int) -> list[int]:
-    pad = [0] * 6
-    pad[2 * (2 - axis)] = 1
-    return pad
 
 
 def _footprint(total: Tensor, row: Tensor, column: Tensor, radius: Tensor) -> Tensor:

@@ -45,7 +45,7 @@ class OccupiedSpace:
         self._bank, self._suspended = bank, suspended
         self.occupancy = OccupancyGrid.full(field.bounds, occupancy_resolution(field, settings))
         if self.carves:
-            hull = self._hull(self.occupancy)
+            hull = _hull(self.occupancy, self._scene)
             self.occupancy = OccupancyGrid(self.occupancy.bounds, hull, hull)
             self._require_occupied(0, "the silhouettes of the training views leave no cell")
         if 0 in settings.filter_rays_at:
@@ -118,11 +118,8 @@ class OccupiedSpace:
         bounds, resolution = self._field.bounds, occupancy_resolution(self._field, self._settings)
         self.occupancy = self.occupancy.at(bounds, resolution)
         if self.carves:
-            hull = self._hull(OccupancyGrid.full(bounds, resolution))
+            hull = _hull(OccupancyGrid.full(bounds, resolution), self._scene)
             self.occupancy = OccupancyGrid(self.occupancy.bounds, self.occupancy.cells * hull, hull)
-
-    def _hull(self, grid: OccupancyGrid) -> torch.Tensor:
-        return _hull(grid, self._scene)
 
     def _require_occupied(self, step: int, why: str) -> None:
         if not bool(self.occupancy.cells.any()):

@@ -146,7 +146,7 @@ def write_json(path: str | os.PathLike[str], value: Any, *, sort_keys: bool = Tr
     """Write ``value`` as indented JSON, keys sorted, whole or not at all.
 
     Floats are written so that they read back bit for bit. JSON knows no infinity and no NaN; a caller that
-    has them turns them into text first (``gridreg.training.metrics.json_number``).
+    has them turns them into text first (``gridreg.training.metrics.json_ready``).
 
     Raises:
         InputError: if the place is not writable or the disk is full.

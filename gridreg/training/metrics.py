@@ -128,20 +128,8 @@ def mean_metrics(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
     return {name: sum(row[name] for row in rows) / len(rows) for name in rows[0]}
 
 
-def json_number(value: float) -> float | str:
-    """The number, or ``"inf"``, ``"-inf"``, ``"nan"`` as text, for which JSON has no number.
-
-    ``float()`` reads both forms back.
-
-    Example:
-        >>> json_number(25.5), json_number(math.inf)
-        (25.5, 'inf')
-    """
-    return float(value) if math.isfinite(value) else str(float(value))
-
-
 def json_ready(value: Any) -> Any:
-    """Plain data in which every float is one that JSON has, see ``json_number``; tuples become lists.
+    """Plain data in which floats that JSON has no number for are text, which ``float`` reads; tuples become lists.
 
     Example:
         >>> json_ready({"psnr": math.inf, "steps": (1, 2)})
@@ -151,7 +139,7 @@ def json_ready(value: Any) -> Any:
         return {str(key): json_ready(inner) for key, inner in value.items()}
     if isinstance(value, (list, tuple)):
         return [json_ready(inner) for inner in value]
-    return json_number(value) if isinstance(value, float) else value
+    return str(float(value)) if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _pair(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:

@@ -211,21 +211,9 @@ _STOPPING = tuple(
 
 
 class Interruption:
-    """Whether somebody asked the run to stop; read ``requested`` after every step.
+    """Whether somebody asked the run to stop; read ``requested``, which the first signal sets, after every step."""
 
-    Args:
-        requested: set by the first signal.
-        signal_number: of that signal, or ``None``.
-    """
-
-    def __init__(self) -> None:
-        self.requested = False
-        self.signal_number: int | None = None
-
-    @property
-    def exit_status(self) -> int:
-        """Exit status by convention: 130 after Ctrl-C, 143 after SIGTERM, 0 if nobody asked."""
-        return 0 if self.signal_number is None else 128 + self.signal_number
+    requested = False
 
 
 @contextmanager
@@ -244,19 +232,18 @@ def interruptible(
         ...             signal.raise_signal(signal.SIGINT)
         ...         if interruption.requested:
         ...             break
-        >>> step, interruption.exit_status
-        (2, 130)
+        >>> step
+        2
     """
     interruption = Interruption()
     if threading.current_thread() is not threading.main_thread():
         yield interruption
         return
 
-    def handle(number: int, _: FrameType | None) -> None:
+    def handle(_: int, __: FrameType | None) -> None:
         if interruption.requested:
             raise KeyboardInterrupt
         interruption.requested = True
-        interruption.signal_number = number
         # Not through sys.stderr: the signal may have come in the middle of a write to it.
         with contextlib.suppress(OSError):
             os.write(2, b"\nstopping after this step and saving; once more to abort\n")
