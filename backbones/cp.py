@@ -6,9 +6,8 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
 
-from backbones.tensorial import TensorialField
+from backbones.tensorial import TensorialField, resampled
 from gridreg import ops
 from gridreg.attach._hooks import open_channels
 from gridreg.attach.sites import Site, parameters
@@ -69,7 +68,7 @@ class CPField(TensorialField):
         """Replace every line by its linear interpolation at new nodes (`upsample_volume_grid`); the ends stay."""
         for lines in (self.density_lines, self.appearance_lines):
             for k, axis in enumerate(LINE_AXES):
-                lines[k] = nn.Parameter(_resampled(lines[k], resolution[axis]))
+                lines[k] = nn.Parameter(resampled(lines[k], (resolution[axis],)))
         self.resolution = resolution
 
     @torch.no_grad()
@@ -102,11 +101,6 @@ def _lines(
         nn.Parameter(scale * torch.randn(resolution[axis], channels, generator=generator))
         for axis in LINE_AXES
     )
-
-
-def _resampled(line: Tensor, size: int) -> Tensor:
-    """Linear interpolation of a line ``(M, C)``, end to end: ``(size, C)``."""
-    return F.interpolate(line.T[None], size=size, mode="linear", align_corners=True)[0].T.contiguous()
 
 
 def _open_components(lines: nn.ParameterList) -> int | None:

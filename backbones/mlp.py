@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -10,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from backbones.hierarchical import intervals, inverse_transform, stratified
-from backbones.tensorial import density_shift_for
+from backbones.tensorial import check_box, density_shift_for
 from gridreg import ops
 from gridreg.attach.sites import Site, parameters
 from gridreg.encodings import octaves_of_channels, positional_encoding
@@ -85,10 +86,7 @@ class MLPField(nn.Module):
         generator: torch.Generator | None = None,
     ) -> None:
         super().__init__()
-        if tuple(bounds.shape) != (2, 3) or not bool((bounds[1] > bounds[0]).all()):
-            raise ValueError(
-                f"bounds={bounds.tolist()}: expected a lower and a larger upper corner, shape (2, 3)"
-            )
+        check_box(bounds)
         sizes = {"width": width, "colour_width": colour_width, "skip": skip, "depth": depth}
         sizes |= {"coarse_samples": coarse_samples, "fine_samples": fine_samples}
         least = {"skip": 0, "depth": skip + 2}
@@ -142,22 +140,16 @@ class MLPField(nn.Module):
     def density(self, x: Tensor) -> Tensor:
         """Density ``(N,)`` per world unit at world positions ``(N, 3)``; 0 outside the box."""
         inside = ((x >= self.bounds[0]) & (x <= self.bounds[1])).all(dim=-1)
-        parts = [x] if torch.is_grad_enabled() else torch.split(x, _CHUNK)
-        density = torch.cat([self._density_of(self._hidden(part)) for part in parts])
+        density = torch.cat([self._density_of(self._hidden(part)) for (part,) in _parts(x)])
         return torch.where(inside, density, torch.zeros_like(density))
 
     def colour(self, x: Tensor, d: Tensor) -> Tensor:
         """Colour ``(N, 3)`` at world positions ``(N, 3)`` seen along unit directions ``(N, 3)``."""
-        parts = [(x, d)]
-        if not torch.is_grad_enabled():
-            parts = list(zip(torch.split(x, _CHUNK), torch.split(d, _CHUNK), strict=True))
-        return torch.cat([self._colour_of(self._hidden(a), b, None) for a, b in parts])
+        return torch.cat([self._colour_of(self._hidden(a), b, None) for a, b in _parts(x, d)])
 
     def colour_of_rays(self, x: Tensor, directions: Tensor, ray_indices: Tensor) -> Tensor:
         """Like `colour` with directions ``(R, 3)`` given per ray and the ray ``(N,)`` of each position."""
-        parts = [(x, ray_indices)]
-        if not torch.is_grad_enabled():
-            parts = list(zip(torch.split(x, _CHUNK), torch.split(ray_indices, _CHUNK), strict=True))
+        parts = _parts(x, ray_indices)
         return torch.cat([self._colour_of(self._hidden(a), directions, b) for a, b in parts])
 
     def colour_of_features(self, features: Tensor, directions: Tensor, ray_indices: Tensor) -> Tensor:
@@ -255,6 +247,13 @@ class MLPField(nn.Module):
 def _pairs(layers: Any) -> list[tuple[Tensor, Tensor | None]]:
     """Weights and biases of linear layers."""
     return [(layer.weight, layer.bias) for layer in layers]
+
+
+def _parts(*positions: Tensor) -> Iterable[tuple[Tensor, ...]]:
+    """Tensors in pieces of equal length, or where a gradient is wanted, whole."""
+    if torch.is_grad_enabled():
+        return [positions]
+    return zip(*(torch.split(x, _CHUNK) for x in positions), strict=True)
 
 
 def _placed(rays: Rays, t: Tensor, met: Tensor, occupancy: OccupancyGrid) -> tuple[Tensor, Tensor]:

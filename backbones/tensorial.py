@@ -41,6 +41,21 @@ def density_shift_for(opacity: float, length: float, distance_scale: float) -> f
     return math.log(math.expm1(-math.log1p(-opacity) / (length * distance_scale)))
 
 
+def resampled(grid: Tensor, size: tuple[int, ...]) -> Tensor:
+    """Linear interpolation of a channels-last plane or line, corner to corner."""
+    mode = "bilinear" if len(size) == 2 else "linear"
+    out = F.interpolate(grid.movedim(-1, 0)[None], size=size, mode=mode, align_corners=True)[0]
+    return out.movedim(0, -1).contiguous()
+
+
+def check_box(bounds: Tensor) -> None:
+    """Refuse what is no box ``(2, 3)``."""
+    if tuple(bounds.shape) != (2, 3) or not bool((bounds[1] > bounds[0]).all()):
+        raise ValueError(
+            f"bounds={bounds.tolist()}: expected a lower and a larger upper corner, shape (2, 3)"
+        )
+
+
 @torch.no_grad()
 def _initialise(modules: Iterable[nn.Module], generator: torch.Generator | None) -> None:
     """The default initial values of linear layers, drawn from a generator; the last bias of a decoder stays 0."""
@@ -94,10 +109,7 @@ class TensorialField(nn.Module):
         **decoder_options: Any,
     ) -> None:
         super().__init__()
-        if tuple(bounds.shape) != (2, 3) or not bool((bounds[1] > bounds[0]).all()):
-            raise ValueError(
-                f"bounds={bounds.tolist()}: expected a lower and a larger upper corner, shape (2, 3)"
-            )
+        check_box(bounds)
         if min(resolution) < 2:
             raise ValueError(f"resolution={resolution}: expected at least 2 nodes along every axis")
         self.register_buffer("bounds", bounds.clone().float())

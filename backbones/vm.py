@@ -6,9 +6,8 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
 
-from backbones.tensorial import TensorialField
+from backbones.tensorial import TensorialField, resampled
 from gridreg import ops
 from gridreg.attach._hooks import open_channels
 from gridreg.attach.sites import Site, parameters
@@ -90,8 +89,8 @@ class VMField(TensorialField):
         for planes, lines in self._pairs():
             for k in range(3):
                 a, b = PLANE_AXES[k]
-                planes[k] = nn.Parameter(_resampled(planes[k], (resolution[a], resolution[b])))
-                lines[k] = nn.Parameter(_resampled(lines[k], (resolution[LINE_AXES[k]],)))
+                planes[k] = nn.Parameter(resampled(planes[k], (resolution[a], resolution[b])))
+                lines[k] = nn.Parameter(resampled(lines[k], (resolution[LINE_AXES[k]],)))
         self.resolution = resolution
 
     @torch.no_grad()
@@ -141,11 +140,3 @@ def _grids(
         )
         lines.append(nn.Parameter(scale * torch.randn(resolution[v], channels, generator=generator)))
     return planes, lines
-
-
-def _resampled(grid: Tensor, size: tuple[int, ...]) -> Tensor:
-    """Linear interpolation of a channels-last grid, corner to corner."""
-    channels_first = grid.movedim(-1, 0)[None]
-    mode = "bilinear" if len(size) == 2 else "linear"
-    out = F.interpolate(channels_first, size=size, mode=mode, align_corners=True)[0]
-    return out.movedim(0, -1).contiguous()
