@@ -21,7 +21,7 @@ from pathlib import Path
 
 import stored
 import torch
-from error_images import kept_run
+from quality import kept_run
 from scipy.stats import spearmanr
 from stored import Record
 

@@ -20,6 +20,7 @@ import torch
 from timing.whole_run import Spans
 
 from gridreg.cli import run_cli
+from gridreg.errors import InputError
 from gridreg.ops import use_backend
 from gridreg.scenes import Scene, Views
 from gridreg.training import StepReport, configure, execute, open_scene
@@ -47,6 +48,18 @@ def record_name(
     length = "" if steps is None else f"-{steps}steps"
     other = "".join(f"-{change}" for change in sorted(changes)).replace("/", "_")
     return f"{scene}-{protocol}-{run.replace(':', '+')}{other}{length}-seed{seed}"
+
+
+def kept_run(folder: Path, scene: str, run: str, seed: int, protocol: str) -> Path:
+    """Return the output folder of a run that is kept in a folder.
+
+    Raises:
+        InputError: if it is not there.
+    """
+    found = folder / record_name(scene, run, seed, None, protocol, ())
+    if not (found / "metrics.json").is_file():
+        raise InputError(f"{found}: found no finished run, expected what benchmarks/quality.py --keep leaves")
+    return found
 
 
 def on_paper(scene: Scene) -> Scene:
