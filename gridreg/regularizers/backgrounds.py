@@ -85,9 +85,6 @@ class RandomBackground(Regularizer):
     Formula: ``background ~ uniform [0, 1]^3``
     Unit: colour
     Source: Instant-NGP (Mueller et al. 2022)
-
-    Raises:
-        InputError: `per` is unknown.
     """
 
     per: Literal["ray", "batch"] = "ray"

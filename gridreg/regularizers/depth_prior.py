@@ -136,9 +136,6 @@ class DepthPrior(Regularizer):
     over pairs; or ``min_{s, q} mean((s d + q - z)^2)``
     Unit: none; world units; squared unit of the target
     Source: FSGS (Zhu et al. 2024); SparseNeRF (Wang et al. 2023); MonoSDF (Yu et al. 2022), after MiDaS
-
-    Raises:
-        InputError: a number is out of range, or the form is unknown.
     """
 
     weight: Numeric = 0.05

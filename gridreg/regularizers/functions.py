@@ -81,7 +81,6 @@ class _FunctionPenalty(Regularizer):
     function: Function | str
 
     def __post_init__(self) -> None:
-        """Refuse at once what can be refused before the first step."""
         super().__post_init__()
         _found(self.function)
 
@@ -105,9 +104,6 @@ class SamplesFunction(_FunctionPenalty):
     Formula: ``mean(f(samples))``
     Unit: the function's
     Source: the function's
-
-    Raises:
-        InputError: the function cannot be called or found, or samples have no such attribute.
     """
 
     where: str = "samples"
@@ -118,7 +114,6 @@ class SamplesFunction(_FunctionPenalty):
     )
 
     def __post_init__(self) -> None:
-        """Refuse at once what can be refused before the first step."""
         super().__post_init__()
         head, _, attribute = self.where.partition(".")
         names = (*RaySamples.__dataclass_fields__, "opacity", "depth")
@@ -152,9 +147,6 @@ class GridFunction(_FunctionPenalty):
     Formula: ``sum over grids of mean(f(g))``
     Unit: the function's
     Source: the function's
-
-    Raises:
-        InputError: the function cannot be called or found, or the site is not one.
     """
 
     site: SiteLike = "density"

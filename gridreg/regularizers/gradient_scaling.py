@@ -89,7 +89,6 @@ class DistanceGradientScaling(Regularizer):
     example_arguments = ({}, {"distance": 5.0})
 
     def __post_init__(self) -> None:
-        """Refuse at once what can be refused before the first step."""
         super().__post_init__()
         if self.distance == 0:
             raise InputError(f"distance={self.distance}: expected a length above 0")

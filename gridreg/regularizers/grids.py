@@ -110,9 +110,6 @@ class L1(Regularizer):
     Unit: unit of the grid
     Source: TensoRF (Chen et al. 2022), sparsity loss
 
-    Raises:
-        InputError: the site or the weight is not one.
-
     Example:
         >>> from gridreg.schedules import Piecewise
         >>> L1("density", weight=Piecewise(values=(8e-5, 4e-5), steps=(2000,))).weight.at(2000, 15_000)

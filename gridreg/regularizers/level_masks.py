@@ -49,7 +49,6 @@ class LevelMask(Mask):
     )
 
     def __post_init__(self) -> None:
-        """Refuse what no run could use."""
         super().__post_init__()
         check_until(self.every, "every")
         if self.begin != 0:

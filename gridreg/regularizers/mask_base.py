@@ -35,7 +35,6 @@ class Mask(Regularizer):
     detach: bool = field(default=False, kw_only=True)
 
     def __post_init__(self) -> None:
-        """Refuse what no run could use."""
         super().__post_init__()
         if self._until() is not None:
             check_until(self._until())

@@ -94,9 +94,6 @@ class OcclusionLoss(Regularizer):
     Formula: ``mean(density * [step < samples])`` over all steps of all rays
     Unit: per world unit (on weights: none)
     Source: FreeNeRF (Yang et al. 2023), occlusion regularization
-
-    Raises:
-        InputError: a number is out of range, both samples and distance are given, or `on` is unknown.
     """
 
     weight: Numeric = 0.01
@@ -109,7 +106,6 @@ class OcclusionLoss(Regularizer):
     example_arguments = ({}, {"distance": 0.5, "on": "weights"}, {"samples": 3, "colour_prior": 5})
 
     def __post_init__(self) -> None:
-        """Refuse at once what can be refused before the first step."""
         super().__post_init__()
         if self.samples is not None and self.distance is not None:
             raise InputError(f"samples={self.samples}, distance={self.distance}: expected one of them")

@@ -215,9 +215,6 @@ class DistortionLoss(Regularizer):
     Formula: ``mean(sum_ij w_i w_j |s_i - s_j| + sum_i w_i^2 d_i / 3)`` over rays
     Unit: world units, or none with near and far
     Source: mip-NeRF 360 (Barron et al. 2022), equation 15
-
-    Raises:
-        InputError: a number is out of range, only one of near and far is given, or far is not beyond near.
     """
 
     weight: Numeric = 1e-3
@@ -226,7 +223,6 @@ class DistortionLoss(Regularizer):
     example_arguments = ({}, {"near": 0.0, "far": 4.0})
 
     def __post_init__(self) -> None:
-        """Refuse at once what can be refused before the first step."""
         super().__post_init__()
         _interval(self.near, self.far)
 

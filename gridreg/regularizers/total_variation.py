@@ -128,9 +128,6 @@ class TotalVariation(Regularizer):
     Unit: squared unit of the grid (absolute: its unit)
     Source: TensoRF (Chen et al. 2022), total variation loss; absolute: Rudin et al. 1992; Huber's: DVGO's program;
     on random cells: Plenoxels (Yu et al. 2022)
-
-    Raises:
-        InputError: an argument is out of range; a grid has no spatial axes.
     """
 
     site: SiteLike
@@ -149,7 +146,6 @@ class TotalVariation(Regularizer):
     )
 
     def __post_init__(self) -> None:
-        """Refuse at once what can be refused before the first step."""
         super().__post_init__()
         if isinstance(self.every, bool) or not isinstance(self.every, int) or self.every < 1:
             raise InputError(f"TotalVariation: found every={self.every!r}, expected an integer of at least 1")
