@@ -1,7 +1,12 @@
 """Regularizers for grid radiance fields, attached from the outside."""
 
+import os
 from types import ModuleType
 from typing import Any
+
+# Read by OpenMP as torch is loaded: by default its idle threads wait in a loop, and where other programs want their
+# processors, a step on two threads takes ten times as long.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 from gridreg.attach._hooks import open_channels as open_channels
 from gridreg.attach._hooks import strip as strip

@@ -57,7 +57,8 @@ def test_frame(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
 def test_scaling(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["scaling", "--repeats", "2", "--rays", "32", "--edge", "10", "--rays-list", "16", "32"]
     words += ["--edge-list", "8", "10", "--channels-list", "4x6", "8x12", "--threads-list", "1", "2"]
-    record, printed = run([*words, "--early-edge", "8", "--channels", "4x6"], tmp_path / "r", capsys)
+    words += ["--early-edge", "8", "--channels", "4x6", "--beside", "1"]
+    record, printed = run(words, tmp_path / "r", capsys)
     assert {name: list(rows) for name, rows in record["tables"].items()} == {
         "rays": ["16", "32"],
         "edge": ["8", "10"],
@@ -67,7 +68,17 @@ def test_scaling(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for rows in record["threads_tables"].values():
         assert list(rows) == ["1", "2"]
     assert printed.count("Two threads against one") == 2
+    assert printed.count("to the power") == 3
+    assert "busy loops beside: 1." in printed
     assert torch.get_num_threads() == 1
+
+
+def test_growth_is_a_power() -> None:
+    from timing.scaling import exponent
+
+    rows = {f"{size}x9": {"seconds": {"median": 0.1 * size**1.5}} for size in (10, 20, 50)}
+    assert exponent(rows) == pytest.approx(1.5)
+    assert exponent({"10": rows["10x9"]}) is None
 
 
 def test_threads_to_try() -> None:

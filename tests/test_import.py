@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -17,6 +18,14 @@ def test_import_is_quick_after_torch() -> None:
     while len(times) < 3 and min(times, default=1.0) >= 0.3:
         times.append(float(subprocess.check_output([sys.executable, "-c", code], text=True)))
     assert min(times) < 0.3
+
+
+def test_idle_threads_do_not_spin_unless_asked_to() -> None:
+    code = "import os, gridreg; print(os.environ['OMP_WAIT_POLICY'])"
+    variables = {key: value for key, value in os.environ.items() if key != "OMP_WAIT_POLICY"}
+    for asked, policy in (({}, "passive"), ({"OMP_WAIT_POLICY": "active"}, "active")):
+        found = subprocess.check_output([sys.executable, "-c", code], env=variables | asked, text=True)
+        assert found.strip() == policy
 
 
 def test_public_names_are_flat_and_exist() -> None:

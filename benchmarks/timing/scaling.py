@@ -3,6 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import math
+import statistics
+import subprocess
+import sys
+from collections.abc import Iterator
 
 import torch
 
@@ -25,6 +31,9 @@ def pair(text: str) -> tuple[int, int]:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--backbone", default="vm", choices=("vm", "cp"))
     parser.add_argument("--repeats", type=common.count, default=15)
+    parser.add_argument(
+        "--beside", type=common.at_least(0), default=0, help="busy loops that other processes run meanwhile"
+    )
     base = parser.add_argument_group("what does not change within a table")
     base.add_argument("--rays", type=common.count, default=1024)
     base.add_argument("--edge", type=common.at_least(2), default=300)
@@ -82,7 +91,35 @@ def powers_up_to(cores: int) -> list[int]:
     return found if found[-1] == cores else [*found, cores]
 
 
+@contextlib.contextmanager
+def busy_loops(count: int) -> Iterator[None]:
+    """Other processes that want a processor each; they are a session of their own, as another user's would be."""
+    loop = [sys.executable, "-c", "while True: pass"]
+    running = [subprocess.Popen(loop, start_new_session=True) for _ in range(count)]
+    try:
+        yield
+    finally:
+        for process in running:
+            process.kill()
+            process.wait()
+
+
+def exponent(rows: dict[str, Record]) -> float | None:
+    """Return p of the least-squares line ``log seconds = p log size + c``; None for fewer than two sizes."""
+    sizes = [math.log(float(name.partition("x")[0])) for name in rows]
+    if len(set(sizes)) < 2:
+        return None
+    seconds = [math.log(row["seconds"]["median"]) for row in rows.values()]
+    return statistics.linear_regression(sizes, seconds).slope
+
+
 def measure(arguments: argparse.Namespace) -> tuple[Record, str]:
+    with busy_loops(arguments.beside):
+        record = _measured(arguments)
+    return record, arguments.backbone + (f"-beside{arguments.beside}" if arguments.beside else "")
+
+
+def _measured(arguments: argparse.Namespace) -> Record:
     kind, repeats = arguments.backbone, arguments.repeats
     own = {"vm": (16, 48), "cp": (96, 288)}[kind]
     base = arguments.channels or own
@@ -111,8 +148,7 @@ def measure(arguments: argparse.Namespace) -> tuple[Record, str]:
             f"{edge}³ with occupancy": ball_step(kind, edge, rays, base),
         }
         threaded = by_threads(steps, numbers, repeats)
-    record: Record = {"tables": tables, "threads_tables": threaded, "speedup": speedups(threaded)}
-    return record, kind
+    return {"tables": tables, "threads_tables": threaded, "speedup": speedups(threaded)}
 
 
 def speedups(threaded: dict[str, dict[str, Record]]) -> dict[str, dict[str, float]]:
@@ -132,7 +168,7 @@ def show(record: Record) -> str:
     arguments = record["arguments"]
     parts = [
         f"Backbone {arguments['backbone']}; where it does not change: {arguments['rays']} rays, "
-        f"edge {arguments['edge']}."
+        f"edge {arguments['edge']}; busy loops beside: {arguments.get('beside', 0)}."
     ]
     for name, rows in record["tables"].items():
         first = next(iter(rows.values()))["seconds"]["median"]
@@ -154,6 +190,9 @@ def show(record: Record) -> str:
             "colour samples per ray",
         ]
         parts.append(common.markdown(head, body))
+        power = exponent(rows)
+        if power is not None:
+            parts.append(f"Time grows as {_LABELS[name]} to the power {power:.2f}.")
     for name, rows in record["threads_tables"].items():
         gains = record["speedup"].get(name, {})
         body = [
