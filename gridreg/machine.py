@@ -119,19 +119,20 @@ def remove_left_behind(folder: Path) -> None:
     """Remove temporary files and folders of processes of this machine that have died."""
     for entry in list(folder.iterdir()):
         found = _TEMPORARY.fullmatch(entry.name)
-        if found is not None and found[1] == _machine() and not _lives(int(found[2])):
+        if found is not None and found[1] == _machine() and not is_process(int(found[2])):
             if entry.is_dir() and not entry.is_symlink():
                 shutil.rmtree(entry, ignore_errors=True)
             else:
                 entry.unlink(missing_ok=True)
 
 
-def _lives(process: int) -> bool:
+def is_process(process: int) -> bool:
+    """Whether there is a process of this number; True where the system does not tell."""
     try:
         os.kill(process, 0)
     except (ProcessLookupError, OverflowError):
         return False
     except OSError:
-        # Somebody else's, or a system that does not tell.
+        # Somebody else's.
         return True
     return True

@@ -17,9 +17,9 @@ import torch
 from gridreg.ablation.perform import Scenes, TaskResult, perform
 from gridreg.ablation.records import RunSpec
 from gridreg.errors import InputError
-from gridreg.machine import remove_left_behind, temporary_beside
+from gridreg.machine import remove_left_behind
 from gridreg.scenes import Scene
-from gridreg.training.files import output_errors, remove_folder
+from gridreg.training.files import output_errors, remove_folder, replacing_folder
 
 
 @dataclass(frozen=True)
@@ -100,18 +100,11 @@ def write_folder(files: Mapping[str, bytes], folder: Path) -> None:
     with output_errors(folder):
         folder.parent.mkdir(parents=True, exist_ok=True)
         remove_left_behind(folder.parent)
-        fresh = temporary_beside(folder)
-        try:
-            fresh.mkdir()
-            for name, content in files.items():
-                place = PurePosixPath(name)
-                # What a worker sends is written below this folder and nowhere else.
-                if place.is_absolute() or ".." in place.parts or not place.parts:
-                    raise InputError(f"{folder}: found {name!r} in what a worker sent, expected plain files")
-                (fresh / place).parent.mkdir(parents=True, exist_ok=True)
-                (fresh / place).write_bytes(content)
-            remove_folder(folder)
-            fresh.rename(folder)
-        except BaseException:
-            remove_folder(fresh)
-            raise
+    with replacing_folder(folder) as fresh:
+        for name, content in files.items():
+            place = PurePosixPath(name)
+            # What a worker sends is written below this folder and nowhere else.
+            if place.is_absolute() or ".." in place.parts or not place.parts:
+                raise InputError(f"{folder}: found {name!r} in what a worker sent, expected plain files")
+            (fresh / place).parent.mkdir(parents=True, exist_ok=True)
+            (fresh / place).write_bytes(content)

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from gridreg.ablation.comparison import Row, Section
 from gridreg.ablation.statistics import Estimate
 from gridreg.ablation.templates import render
+from gridreg.training.progress import clock_time
 
 MINUS = "\N{MINUS SIGN}"
 
@@ -72,9 +73,7 @@ def duration(seconds: float) -> str:
     """
     if seconds < 59.95:
         return f"{seconds:.1f} s"
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02}:{rest:02} h" if hours else f"{minutes}:{rest:02} min"
+    return f"{clock_time(seconds)} {'h' if round(seconds) >= 3600 else 'min'}"
 
 
 def notes_of(row: Row) -> list[str]:

@@ -8,6 +8,7 @@ import platform
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from gridreg.machine import is_process
 from gridreg.training.typed_data import from_data
 
 
@@ -48,11 +49,7 @@ class Worker:
             return None
         if self.place:
             return _started(self.process) == self.started
-        try:
-            os.kill(self.process, 0)
-        except OSError as error:
-            return not isinstance(error, ProcessLookupError)
-        return True
+        return is_process(self.process)
 
     def to_text(self) -> str:
         """As one line of text, see `from_text`."""

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable
+from contextlib import suppress
 from fractions import Fraction
 from pathlib import Path
 
@@ -16,8 +15,7 @@ import numpy as np
 from PIL import Image
 
 from gridreg.errors import InputError
-from gridreg.machine import temporary_beside
-from gridreg.training.files import check_output_folder, output_errors, writing
+from gridreg.training.files import check_output_folder, replacing_folder, writing
 from gridreg.training.images import ImageArray
 
 
@@ -75,7 +73,8 @@ def write_video(path: str | Path, frames: Iterable[ImageArray], fps: float = 30.
         with writing(path) as temporary:
             _write_gif(temporary, frames, fps)
     else:
-        with _writing_folder(path) as folder:
+        _check_frames(path)
+        with replacing_folder(path) as folder:
             for number, frame in enumerate(frames):
                 Image.fromarray(frame).save(folder / f"frame_{number:04d}.png")
 
@@ -136,22 +135,10 @@ def _write_gif(path: Path, frames: Iterable[ImageArray], fps: float) -> None:
     first.save(path, save_all=True, append_images=images, duration=max(20, round(1000 / fps)), loop=0)
 
 
-@contextmanager
-def _writing_folder(path: Path) -> Iterator[Path]:
-    """A temporary folder that takes the place of ``path``, where nothing but frames may stand."""
+def _check_frames(path: Path) -> None:
+    """Refuse a place for frames where anything else stands."""
     if path.exists() and not path.is_dir():
         raise InputError(f"{path}: a file stands where a folder of frames is expected; choose another name")
     others = [p.name for p in path.iterdir() if not p.match("frame_*.png")] if path.is_dir() else []
     if others:
         raise InputError(f"{path}: holds {others[0]!r}, expected a new folder or one of frames alone")
-    temporary, old = temporary_beside(path), temporary_beside(path)
-    with output_errors(path):
-        try:
-            temporary.mkdir()
-            yield temporary
-            if path.is_dir():
-                os.replace(path, old)
-            os.replace(temporary, path)
-        finally:
-            shutil.rmtree(temporary, ignore_errors=True)
-            shutil.rmtree(old, ignore_errors=True)

@@ -85,6 +85,25 @@ def writing(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 @contextmanager
+def replacing_folder(path: Path) -> Iterator[Path]:
+    """A new folder to fill; on leaving it takes the place of the folder ``path``, which stays if the block raises.
+
+    Raises:
+        InputError: if the place is not writable or the disk is full.
+    """
+    scratch = temporary_beside(path)
+    with output_errors(path):
+        try:
+            (scratch / "new").mkdir(parents=True)
+            yield scratch / "new"
+            if path.is_dir():
+                os.replace(path, scratch / "old")
+            os.replace(scratch / "new", path)
+        finally:
+            shutil.rmtree(scratch, ignore_errors=True)
+
+
+@contextmanager
 def one_writer(folder: str | os.PathLike[str]) -> Iterator[None]:
     """Hold a folder for one process; the hold dies with the process, whatever ends it.
 
