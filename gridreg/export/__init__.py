@@ -1,60 +1,37 @@
 """Meshes, videos, and a look at the field in a browser."""
 
-from gridreg.export.camera_files import load_cameras, save_cameras
-from gridreg.export.camera_paths import CAMERA_PATHS, camera_path, spiral, sway, tour, turntable
-from gridreg.export.cameras import Orbit, look_at, orbit_of_box, orbit_of_views
-from gridreg.export.compare import MeshComparison, compare_meshes
-from gridreg.export.images import MODES, to_image
-from gridreg.export.mesh import Mesh, extract_mesh
-from gridreg.export.mesh_files import read_mesh, save_mesh, write_mesh
-from gridreg.export.next_view import NextView, next_view
-from gridreg.export.page import write_page
-from gridreg.export.runs import (
-    LiveView,
-    check_drawing,
-    draw_run,
-    live_view,
-    video_path,
-)
-from gridreg.export.video import render_frames, render_video
-from gridreg.export.viewer import Viewer
-from gridreg.rendering.cameras import Camera, Lens
-from gridreg.rendering.model import Model
-
-__all__ = [
-    "CAMERA_PATHS",
-    "MODES",
-    "Camera",
-    "Lens",
-    "LiveView",
-    "Mesh",
-    "MeshComparison",
-    "Model",
-    "NextView",
-    "Orbit",
-    "Viewer",
-    "camera_path",
-    "check_drawing",
-    "compare_meshes",
-    "draw_run",
-    "extract_mesh",
-    "video_path",
-    "live_view",
-    "load_cameras",
-    "look_at",
-    "next_view",
-    "orbit_of_box",
-    "orbit_of_views",
-    "to_image",
-    "read_mesh",
-    "render_frames",
-    "render_video",
-    "save_cameras",
-    "save_mesh",
-    "spiral",
-    "sway",
-    "tour",
-    "turntable",
-    "write_mesh",
-    "write_page",
-]
+from gridreg.export.camera_files import load_cameras as load_cameras
+from gridreg.export.camera_files import save_cameras as save_cameras
+from gridreg.export.camera_paths import CAMERA_PATHS as CAMERA_PATHS
+from gridreg.export.camera_paths import camera_path as camera_path
+from gridreg.export.camera_paths import spiral as spiral
+from gridreg.export.camera_paths import sway as sway
+from gridreg.export.camera_paths import tour as tour
+from gridreg.export.camera_paths import turntable as turntable
+from gridreg.export.cameras import Orbit as Orbit
+from gridreg.export.cameras import look_at as look_at
+from gridreg.export.cameras import orbit_of_box as orbit_of_box
+from gridreg.export.cameras import orbit_of_views as orbit_of_views
+from gridreg.export.compare import MeshComparison as MeshComparison
+from gridreg.export.compare import compare_meshes as compare_meshes
+from gridreg.export.images import MODES as MODES
+from gridreg.export.images import to_image as to_image
+from gridreg.export.mesh import Mesh as Mesh
+from gridreg.export.mesh import extract_mesh as extract_mesh
+from gridreg.export.mesh_files import read_mesh as read_mesh
+from gridreg.export.mesh_files import save_mesh as save_mesh
+from gridreg.export.mesh_files import write_mesh as write_mesh
+from gridreg.export.next_view import NextView as NextView
+from gridreg.export.next_view import next_view as next_view
+from gridreg.export.page import write_page as write_page
+from gridreg.export.runs import LiveView as LiveView
+from gridreg.export.runs import check_drawing as check_drawing
+from gridreg.export.runs import draw_run as draw_run
+from gridreg.export.runs import live_view as live_view
+from gridreg.export.runs import video_path as video_path
+from gridreg.export.video import render_frames as render_frames
+from gridreg.export.video import render_video as render_video
+from gridreg.export.viewer import Viewer as Viewer
+from gridreg.rendering.cameras import Camera as Camera
+from gridreg.rendering.cameras import Lens as Lens
+from gridreg.rendering.model import Model as Model
