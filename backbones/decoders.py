@@ -12,7 +12,8 @@ from torch import Tensor, nn
 
 from gridreg import ops
 from gridreg.attach._hooks import open_channels
-from gridreg.attach.sites import Site, inputs, parameters
+from gridreg.attach.selectors import inputs, parameters
+from gridreg.attach.sites import Site
 from gridreg.encodings import octaves_of_channels
 from gridreg.ops.perceptron import Precision
 

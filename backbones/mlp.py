@@ -13,7 +13,8 @@ from torch.nn import functional as F
 from backbones.hierarchical import intervals, inverse_transform, stratified
 from backbones.tensorial import check_box, density_shift_for
 from gridreg import ops
-from gridreg.attach.sites import Site, parameters
+from gridreg.attach.selectors import parameters
+from gridreg.attach.sites import Site
 from gridreg.encodings import octaves_of_channels, positional_encoding
 from gridreg.ops.fused_adam import FusedAdam
 from gridreg.ops.perceptron import Precision

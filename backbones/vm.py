@@ -10,7 +10,8 @@ from torch import Tensor, nn
 from backbones.tensorial import TensorialField, resampled
 from gridreg import ops
 from gridreg.attach._hooks import open_channels
-from gridreg.attach.sites import Site, parameters
+from gridreg.attach.selectors import parameters
+from gridreg.attach.sites import Site
 from gridreg.ops.interpolation import LINE_AXES, PLANE_AXES
 
 

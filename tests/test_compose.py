@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from torch import nn
 
 import gridreg
-from gridreg.attach.sites import Selector, Site
+from gridreg.attach.selectors import Selector
+from gridreg.attach.sites import Site
 from gridreg.base import REGISTRY, Regularizer
 from gridreg.schedules import Schedule
 from tests.fields import made

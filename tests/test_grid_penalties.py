@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.autograd import gradcheck
 
-from gridreg.attach.sites import Grid, parameters
+from gridreg.attach.selectors import parameters
+from gridreg.attach.sites import Grid
 from gridreg.base import Clock, Context, LocalTerm
 from gridreg.errors import InputError
 from gridreg.regularizers.grids import L1, Orthogonality, l1, orthogonality

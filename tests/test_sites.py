@@ -10,7 +10,8 @@ from torch import Tensor, nn
 
 import gridreg
 from gridreg.attach._resolve import Match, find
-from gridreg.attach.sites import Selector, Site
+from gridreg.attach.selectors import Selector
+from gridreg.attach.sites import Site
 
 
 class Block(nn.Module):

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 
 from gridreg.attach._resolve import Match
 from gridreg.attach._slots import Slot
-from gridreg.attach.sites import Grid, Selector, SiteLike
+from gridreg.attach.selectors import Selector
+from gridreg.attach.sites import Grid, SiteLike
 from gridreg.base import Clock, Context, Regularizer, overrides
 from gridreg.errors import InputError
 

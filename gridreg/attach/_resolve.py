@@ -12,7 +12,8 @@ from typing import Literal, TypeAlias
 from torch import Tensor, nn
 from torch.nn.parameter import is_lazy
 
-from gridreg.attach.sites import Grid, Place, Selector, Site, SiteLike, spatial_axes
+from gridreg.attach.selectors import Selector
+from gridreg.attach.sites import Grid, Place, Site, SiteLike, spatial_axes
 from gridreg.errors import InputError, near_names
 
 # DistributedDataParallel and DataParallel, and torch.compile.

@@ -10,10 +10,8 @@ from typing import Literal, TypeAlias, get_args, get_origin, get_type_hints
 import torch
 from torch import Tensor
 
-from gridreg.attach.selectors import Kind, Selector, abridged, inputs, outputs, parameters
+from gridreg.attach.selectors import Kind, Selector, abridged
 from gridreg.errors import InputError
-
-__all__ = ["Grid", "Place", "Selector", "Site", "SiteLike", "inputs", "outputs", "parameters"]
 
 # No grid has so many nodes along an edge: an axis beyond is the entries of a table.
 _LONGEST_EDGE = 4096

@@ -8,7 +8,8 @@ from dataclasses import MISSING, fields
 from typing import Any
 
 from gridreg.attach.handle import Handle
-from gridreg.attach.sites import Selector, Site, inputs, outputs, parameters
+from gridreg.attach.selectors import Selector, inputs, outputs, parameters
+from gridreg.attach.sites import Site
 from gridreg.base import REGISTRY, Regularizer
 from gridreg.errors import InputError, near_names
 from gridreg.schedules import SCHEDULES, Schedule

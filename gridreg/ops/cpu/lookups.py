@@ -20,8 +20,6 @@ from gridreg.ops.gradient_buffers import gradient_buffers, rounding_fraction
 from gridreg.ops.interpolation import suits_cpu
 from gridreg.ops.ray_marching import Activation, MarchArguments, RayMarchResult
 
-__all__: list[str] = []
-
 
 class _Lookup(torch.autograd.Function):
     """A lookup with its compiled backward pass; grids are planes, if any, and three lines."""

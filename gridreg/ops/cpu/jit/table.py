@@ -12,30 +12,12 @@ import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
 from numba import extending, types
 from numba.np import arrayobj
-from numpy import float32, float64, int32, int64, uint8, uint16
-
-__all__ = [
-    "TABLE",
-    "Cube",
-    "Matrix",
-    "Table",
-    "Vector",
-    "cube",
-    "float32",
-    "float64",
-    "int32",
-    "int64",
-    "integer",
-    "intrinsic",
-    "matrix",
-    "next_task",
-    "real",
-    "scratch",
-    "size",
-    "uint8",
-    "uint16",
-    "vector",
-]
+from numpy import float32 as float32
+from numpy import float64 as float64
+from numpy import int32 as int32
+from numpy import int64 as int64
+from numpy import uint8 as uint8
+from numpy import uint16 as uint16
 
 _T = TypeVar("_T", bound=np.generic)
 # Tensors as kernels see them: all elements in one row, or two or three axes.
