@@ -16,7 +16,7 @@ from gridreg.scenes import builtin_scene
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 from timing import common, machine, main, roofline, situations
-from timing.work import PARTS, Work
+from timing.work import Work
 
 from tests.speed_runs import COUNTS
 
@@ -93,7 +93,7 @@ def test_roofline(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert main.main(words) == 0
     record = json.loads((tmp_path / "speed.jsonl").read_text())
     (one,) = record["situations"]
-    assert list(one["rows"]) == list(PARTS)
+    assert {"rays", "march", "density", "optimiser"} < one["rows"].keys()
     assert 0 < one["share"] <= one["share_with_caches"]
     assert one["rows"]["backward/lookup"]["seconds"] > 0
     assert 0.8 < one["sum_of_stages"] <= 1

@@ -21,7 +21,7 @@ from .common import Record
 from .machine import Machine
 from .situations import Situation, require_grid
 from .stopwatch import replaced
-from .work import PARTS, Counts, Work, work
+from .work import Counts, Work, work
 
 HELP = "bytes and operations of a step against bandwidth and arithmetic rate, by stage"
 
@@ -234,8 +234,7 @@ def show(record: Record) -> str:
     ]
     for one in record["situations"]:
         rows: list[list[str]] = []
-        for name in PARTS:
-            row = one["rows"][name]
+        for name, row in one["rows"].items():
             took = row["seconds"]
             rows.append(
                 [

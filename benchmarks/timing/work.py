@@ -49,21 +49,6 @@ from __future__ import annotations
 import itertools
 from dataclasses import dataclass
 
-#: Stages of the roofline in the order of an iteration; parts as `speed.stopwatch` names them.
-PARTS = (
-    "rays",
-    "march",
-    "density",
-    "colour/lookup",
-    "colour/network",
-    "compositing",
-    "backward/other",
-    "backward/network",
-    "backward/lookup",
-    "backward/density",
-    "optimiser",
-)
-
 
 @dataclass(frozen=True)
 class Counts:

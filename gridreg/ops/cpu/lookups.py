@@ -97,13 +97,14 @@ class _Activated(torch.autograd.Function):
         return (None, None, None, None, None, *_gradients(ctx, u, grids, upstream))
 
 
+@vm_ops.vm_march_density.register_cpu()
 def _march_density(
     march: MarchArguments,
     activation: Activation,
     transmittance_bound: float,
     planes: Sequence[Tensor],
     lines: Sequence[Tensor],
-    open_channels: int | None,
+    open_channels: int | None = None,
 ) -> RayMarchResult:
     """March without planes through a CP grid, else through a VM grid."""
     lines, read = _opened(lines, open_channels)
@@ -121,18 +122,6 @@ def _march_density(
     backward = vm_gradient.density_backward if planes else cp.density_backward
     density: Tensor = _Activated.apply(backward, found.density, u, activation.scale, read, *grids)  # type: ignore[no-untyped-call]
     return found._replace(density=density)
-
-
-@vm_ops.vm_march_density.register_cpu()
-def _vm_march_density(
-    march: MarchArguments,
-    activation: Activation,
-    transmittance_bound: float,
-    planes: Sequence[Tensor],
-    lines: Sequence[Tensor],
-    open_channels: int | None = None,
-) -> RayMarchResult:
-    return _march_density(march, activation, transmittance_bound, planes, lines, open_channels)
 
 
 @cp_ops.cp_march_density.register_cpu()
