@@ -30,7 +30,6 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 from timing.ball import ball_field
 
-from gridreg.ablation.export import export_results
 from gridreg.ablation.report import write_report
 from gridreg.ablation.store import Store
 from gridreg.ablation.study import study_from_text
@@ -113,7 +112,7 @@ def make_study(folder: Path, seeds: int = 1500) -> None:
 def study(folder: Path) -> Any:
     """Write the table and the report of a study of 3,000 runs."""
     store = Store.open(folder, create=False)
-    export_results(store.results(), folder / "table.csv")
+    store.export(folder / "table.csv")
     return write_report(store, store.study("load"), folder / "report.html").stat().st_size
 
 

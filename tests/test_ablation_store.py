@@ -19,7 +19,6 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 
 from gridreg.ablation.claims import LEASE_SECONDS, Claim, ClaimLostError, heartbeat
 from gridreg.ablation.database import APPLICATION_ID, SCHEMA_VERSION, DiskFullError
-from gridreg.ablation.export import export_results
 from gridreg.ablation.store import MOST_LOSSES, Store
 from gridreg.ablation.workers import Worker
 from gridreg.errors import InputError
@@ -265,7 +264,7 @@ def test_export_csv(store, tmp_path):
     store.add(study_of(spec("a, b"), spec("c"), spec("d")))
     finish(store, claimed(store), 20.123456789, machine="m")
     store.fail(claimed(store), "it broke")
-    path = export_results(store.results("study"), tmp_path / "table.csv")
+    path = store.export(tmp_path / "table.csv", "study")
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [(r["label"], r["status"], r["reason"]) for r in rows] == [
@@ -284,7 +283,7 @@ def test_cells_that_begin_like_formulas_are_text(store, tmp_path):
     store.add(study_of(*(spec(label) for label in labels)))
     store.fail(claimed(store), "=HYPERLINK(1)")
     finish(store, claimed(store), -2.5)
-    with export_results(store.results("study"), tmp_path / "table.csv").open(newline="") as file:
+    with store.export(tmp_path / "table.csv", "study").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["label"] for row in rows] == ["'=1+1", "'+x", "'-x", "'@x", "'\tx", "x=1", "−1"]
     assert rows[0]["reason"] == "'=HYPERLINK(1)"
@@ -296,7 +295,7 @@ def test_export_parquet(store, tmp_path):
     parquet = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed")
     store.add(study_of(spec("a"), spec("b")))
     finish(store, claimed(store), 20.5)
-    export_results(store.results(), tmp_path / "table.parquet")
+    store.export(tmp_path / "table.parquet")
     rows = parquet.read_table(tmp_path / "table.parquet").to_pylist()
     assert [(r["label"], r["psnr"], r["views"]) for r in rows] == [("a", 20.5, 8), ("b", None, 8)]
 
@@ -304,16 +303,16 @@ def test_export_parquet(store, tmp_path):
 def test_parquet_without_pyarrow(store, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(InputError, match=r"Parquet needs pyarrow.*gridreg\[parquet\]"):
-        export_results(store.results(), tmp_path / "table.parquet")
+        store.export(tmp_path / "table.parquet")
     assert list(tmp_path.glob("*.parquet")) == []
 
 
 def test_export_to_something_else(store, tmp_path):
     with pytest.raises(InputError, match=r"found the ending '\.xls'"):
-        export_results(store.results(), tmp_path / "table.xls")
+        store.export(tmp_path / "table.xls")
     with pytest.raises(InputError, match=r"expected \.csv or \.parquet"):
-        export_results(store.results(), tmp_path / "table")
-    assert export_results(store.results(), tmp_path / "empty.csv").read_text() == "label\n"
+        store.export(tmp_path / "table")
+    assert store.export(tmp_path / "empty.csv").read_text() == "label\n"
 
 
 def test_several_writers_some_of_them_killed(store):
@@ -488,7 +487,7 @@ def test_content_that_is_damaged(store, damage):
         again.studies()
         again.results(study)
         again.counts()
-        export_results(again.results(), store.folder / "table.csv")
+        again.export(store.folder / "table.csv")
 
     with pytest.raises(InputError, match=r"store\.sqlite: ") as caught:
         use()

@@ -9,7 +9,6 @@ from typing import Literal
 
 import tyro
 
-from gridreg.ablation.export import export_results
 from gridreg.ablation.processes import Processes
 from gridreg.ablation.progress import StudyProgress, dry_run_lines
 from gridreg.ablation.records import RunResult, Study
@@ -162,7 +161,7 @@ def _conclude(store: Store, study: Study, options: AblationOptions, interrupted:
         if result.status == "failed":
             print(f"failed: {result.spec.describe()}: {result.reason}", file=sys.stderr)
     if options.export is not None:
-        print(f"table: {export_results(store.results(study), options.export)}")
+        print(f"table: {store.export(options.export, study)}")
     if options.report:
         from gridreg.ablation.report import write_report
 

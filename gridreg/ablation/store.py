@@ -22,6 +22,7 @@ from typing import Any
 from gridreg.ablation import transitions
 from gridreg.ablation.claims import Claim
 from gridreg.ablation.database import Database
+from gridreg.ablation.export import export_results
 from gridreg.ablation.records import STATUSES, RunResult, Status, Study
 from gridreg.ablation.transitions import OF_STUDY, RESULT_NAME, name_of, set_status, status_of
 from gridreg.ablation.workers import Worker
@@ -273,6 +274,14 @@ class Store:
         query = f"SELECT {columns} FROM attempts WHERE number>? ORDER BY number"
         with self._database.reading() as connection:
             return [dict(row) for row in connection.execute(query, (since,))]
+
+    def export(self, path: str | os.PathLike[str], study: Study | str | None = None) -> Path:
+        """Write a table of the runs, one a line, to a name that ends in ``.csv`` or ``.parquet`` (needs pyarrow).
+
+        Raises:
+            InputError: of `gridreg.ablation.export.export_results`.
+        """
+        return export_results(self.results(study), Path(path))
 
     @contextmanager
     def _held(self, claim: Claim) -> Iterator[sqlite3.Connection]:

@@ -16,7 +16,9 @@ from typing import Any, Literal, TypeVar, get_origin
 from gridreg.errors import InputError
 from gridreg.training.files import write_text
 from gridreg.training.strict_yaml import Document, dump_yaml, parse_yaml, read_yaml
-from gridreg.training.typed_data import alternatives, field_types, from_data, to_data
+from gridreg.training.typed_data import alternatives, field_types
+from gridreg.training.typed_data import from_data as from_data
+from gridreg.training.typed_data import to_data as to_data
 
 T = TypeVar("T")
 

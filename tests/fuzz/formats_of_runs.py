@@ -14,7 +14,6 @@ from typing import Any
 from hypothesis import strategies as st
 
 from gridreg.ablation.claims import ClaimLostError
-from gridreg.ablation.export import export_results
 from gridreg.ablation.store import Store
 from gridreg.ablation.study import load_study, study_from_text
 from gridreg.ablation.table_report import read_table
@@ -197,7 +196,7 @@ def used_store(folder: Path) -> None:
         with contextlib.suppress(ClaimLostError):
             store.finish(claim, result, fingerprint="a")
     store.retry()
-    export_results(store.results(), folder / "table.csv")
+    store.export(folder / "table.csv")
 
 
 @st.composite
