@@ -75,6 +75,7 @@ def run(options: MeshOptions) -> int:
         threshold=options.threshold,
         min_component=options.min_component,
         colours=options.colours,
+        cameras=loaded.cameras,
     )
     closed = "watertight" if mesh.watertight else "not watertight"
     print(

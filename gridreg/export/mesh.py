@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 import trimesh
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree  # type: ignore[import-untyped]
 from torch import Tensor
 
 from gridreg.errors import InputError
 from gridreg.export.decimation import decimate
 from gridreg.export.marching import Faces, Vertices, drop_small_components, polygonise, vertex_normals
+from gridreg.export.unseen import fill_unseen
 from gridreg.export.volume import SeenDensity, sample_density, surface_threshold
 from gridreg.machine import check_memory
-from gridreg.rendering import Field, OccupancyGrid
+from gridreg.rendering import Camera, Field, OccupancyGrid
 from gridreg.segments import optical_depth_to_weights
 
 Colours = NDArray[np.uint8]
+
+_FILLED = 0.25
+"""How far filled a vertex is whose colour no camera sees; the border of what is filled is at 1/2."""
 
 
 @dataclass(frozen=True)
@@ -101,6 +107,7 @@ def extract_mesh(
     colours: bool = True,
     min_component: float = 0.01,
     fill_cavities: bool = True,
+    cameras: Sequence[Camera] = (),
     refine: int = 8,
     chunk: int = 1 << 18,
 ) -> Mesh:
@@ -120,6 +127,9 @@ def extract_mesh(
         min_component: parts with less surface than this fraction of that of the largest part are dropped.
         fill_cavities: leave out surfaces that cannot be reached from outside. What a field holds inside a
             solid was never seen by any camera.
+        cameras: that the field was trained on. Where they see nothing within the hull of their silhouettes, as under
+            an object on a table, it is solid, in the colour of the nearest surface that they see; none, or no hull: as
+            the field has it.
         refine: bisection steps that move the vertices onto the level set.
         chunk: positions evaluated at once.
 
@@ -139,11 +149,18 @@ def extract_mesh(
     density = SeenDensity(field, occupancy, chunk)
     volume = sample_density(density, box, resolution)
     level = surface_threshold(volume) if threshold is None else threshold
+    filled = None
+    if len(cameras) and occupancy is not None and occupancy.hull is not None:
+        filled = fill_unseen(volume, level, cameras, occupancy)
+        np.maximum(volume.values, 2 * level * filled.values, out=volume.values)
 
     def inside_box(positions: Vertices) -> NDArray[np.float32]:
         x = torch.from_numpy(positions).to(box)
-        outside = ((x < box[0]) | (x > box[1])).any(dim=-1)
-        return density(x).masked_fill(outside, 0.0).cpu().numpy()
+        outside = ((x < box[0]) | (x > box[1])).any(dim=-1).cpu().numpy()
+        found = density(x).cpu().numpy()
+        if filled is not None:
+            found = np.maximum(found, 2 * level * filled.at(positions))
+        return np.where(outside, np.float32(0), found)
 
     vertices, faces = polygonise(volume, level, inside_box, refine=refine, fill_cavities=fill_cavities)
     if not len(faces):
@@ -156,7 +173,18 @@ def extract_mesh(
     if colours:
         depth = float(volume.spacing.mean())
         seen = seen_colours(field, density, vertices, vertex_normals(vertices, faces), depth, chunk)
+        if filled is not None:
+            seen = _spread(seen, vertices, filled.at(vertices) < _FILLED)
     return Mesh(vertices, faces, seen, level)
+
+
+def _spread(colours: Colours, vertices: Vertices, known: NDArray[np.bool_]) -> Colours:
+    """Give vertices whose colour is not known that of the nearest one whose is."""
+    if known.all() or not known.any():
+        return colours
+    found: Colours = colours.copy()
+    found[~known] = colours[known][cKDTree(vertices[known]).query(vertices[~known])[1]]
+    return found
 
 
 @torch.no_grad()

@@ -88,7 +88,13 @@ def draw_run(run: Execution, *, mesh: bool = True, video: bool = True) -> list[P
         print("no mesh: the field of a forward-facing scene is not in world coordinates", file=sys.stderr)
     elif mesh:
         try:
-            write_mesh(trainer.field, run.out / "mesh.ply", trainer.occupancy, world=run.scene.world)
+            write_mesh(
+                trainer.field,
+                run.out / "mesh.ply",
+                trainer.occupancy,
+                world=run.scene.world,
+                cameras=run.scene.train.cameras,
+            )
             written.append(run.out / "mesh.ply")
         except InputError as error:
             print(f"no mesh: {error}", file=sys.stderr)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy import ndimage  # type: ignore[import-untyped]
 from torch import Tensor
 
 from gridreg.errors import InputError
@@ -64,6 +65,12 @@ class DensityVolume:
     values: Array
     lower: NDArray[np.float64]
     spacing: NDArray[np.float64]
+
+    def at(self, positions: NDArray[np.float64]) -> Array:
+        """Return the values between nodes at positions ``(N, 3)``, linearly interpolated, ``(N,)``."""
+        index = (positions - self.lower) / self.spacing
+        found = ndimage.map_coordinates(self.values, index.T, order=1, mode="nearest")
+        return np.asarray(found, dtype=np.float32)
 
 
 def lattice_nodes(bounds: Tensor, resolution: int) -> tuple[int, int, int]:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gridreg.errors import InputError
+from gridreg.rendering import Camera, Lens
 from gridreg.scenes.gate import check_cameras, check_extent
 from gridreg.scenes.notebook import card, thumbnails
 from gridreg.scenes.pixels import as_floats
@@ -136,6 +137,14 @@ class Views:
     def width(self) -> int:
         """Columns of every image."""
         return int(self.pixels.shape[2])
+
+    @property
+    def cameras(self) -> tuple[Camera, ...]:
+        """The camera of each image."""
+        return tuple(
+            Camera(pose, Lens.from_tensor(lens, self.height, self.width))
+            for pose, lens in zip(self.poses, self.intrinsics, strict=True)
+        )
 
     @property
     def rgba(self) -> Tensor:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gridreg.rendering import Camera, Lens, Model, Rendered
+from gridreg.rendering import Model, Rendered
 from gridreg.scenes import Views
 from gridreg.training.metrics import image_metrics, psnr
 
@@ -34,8 +34,8 @@ class Scored:
 
 def render_views(model: Model, views: Views) -> Iterator[Rendered]:
     """Images of a field from the cameras of views, one after the other."""
-    for pose, intrinsics in zip(views.poses, views.intrinsics, strict=True):
-        rendered = model.render(Camera(pose, Lens.from_tensor(intrinsics, views.height, views.width)))
+    for camera in views.cameras:
+        rendered = model.render(camera)
         assert rendered is not None
         yield rendered
 

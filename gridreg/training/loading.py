@@ -14,8 +14,10 @@ import gridreg
 from gridreg.errors import InputError
 from gridreg.fields import import_modules, make_field
 from gridreg.rendering import (
+    Camera,
     Ensemble,
     JoinedSurroundings,
+    Lens,
     Model,
     OccupancyGrid,
     Surroundings,
@@ -47,6 +49,7 @@ class LoadedRun(Model):
         fingerprint: of the scene it was trained on, see `gridreg.scenes.Scene`.
         world: where the scene lies in the world of its files.
         exposed: whether exposures of the photographs were estimated.
+        cameras: of the training views; older checkpoints do not have them.
         members: the runs that an ensemble is made of, else none.
     """
 
@@ -55,6 +58,7 @@ class LoadedRun(Model):
     fingerprint: str
     world: World = IN_PLACE
     exposed: bool = False
+    cameras: tuple[Camera, ...] = ()
     members: tuple[LoadedRun, ...] = ()
 
     def __repr__(self) -> str:
@@ -171,6 +175,19 @@ def _run(
         step=int(trainer["step"]),
         fingerprint=fingerprint,
         world=_saved_world(state.get("world")),
+        cameras=_saved_cameras(state.get("cameras")),
+    )
+
+
+def _saved_cameras(saved: dict[str, Any] | None) -> tuple[Camera, ...]:
+    if saved is None:
+        return ()
+    poses, lenses = saved["poses"].float(), saved["intrinsics"]
+    size = int(saved["height"]), int(saved["width"])
+    if poses.shape[1:] != (4, 4) or not bool(torch.isfinite(poses).all()):
+        raise ValueError("poses of the training views are not (V, 4, 4) finite numbers")
+    return tuple(
+        Camera(pose, Lens.from_tensor(lens, *size)) for pose, lens in zip(poses, lenses, strict=True)
     )
 
 

@@ -15,7 +15,7 @@ from gridreg.base import Regularizer
 from gridreg.errors import InputError
 from gridreg.fields import make_field
 from gridreg.machine import check_memory
-from gridreg.scenes import IN_PLACE, Scene, builtin_scene, default_protocol, load_scene
+from gridreg.scenes import IN_PLACE, Scene, Views, builtin_scene, default_protocol, load_scene
 from gridreg.training.checkpoint import load_checkpoint, save_checkpoint, sound
 from gridreg.training.events import carved_box, resolution_of
 from gridreg.training.settings import RunConfig
@@ -109,11 +109,17 @@ def save_run(folder: Path, trainer: Trainer, config: RunConfig, record: dict[str
         "warp": None if trainer.warp is None else asdict(trainer.warp),
         "bounds": trainer.scene.bounds,
         "background": trainer.scene.background,
+        "cameras": _cameras(trainer.scene.train),
         "record": record,
     }
     if trainer.scene.world != IN_PLACE:
         state["world"] = trainer.scene.world._asdict() | {"origin": list(trainer.scene.world.origin)}
     save_checkpoint(folder, state, config=to_data(config), fingerprint=trainer.scene.fingerprint)
+
+
+def _cameras(views: Views) -> dict[str, Any]:
+    size = {"height": views.height, "width": views.width}
+    return {"poses": views.poses, "intrinsics": views.intrinsics, **size}
 
 
 def resume_trainer(
