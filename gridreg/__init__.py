@@ -43,9 +43,6 @@ from gridreg.regularizers.backgrounds import ExpectedBackground as ExpectedBackg
 from gridreg.regularizers.backgrounds import RandomBackground as RandomBackground
 from gridreg.regularizers.backgrounds import opacity_error as opacity_error
 from gridreg.regularizers.backgrounds import random_background as random_background
-from gridreg.regularizers.channel_masks import CosineMask as CosineMask
-from gridreg.regularizers.channel_masks import FixedMask as FixedMask
-from gridreg.regularizers.channel_masks import FrequencyMask as FrequencyMask
 from gridreg.regularizers.density import CauchySparsity as CauchySparsity
 from gridreg.regularizers.density import Eikonal as Eikonal
 from gridreg.regularizers.density import cauchy_sparsity as cauchy_sparsity
@@ -58,6 +55,9 @@ from gridreg.regularizers.dropout import ComponentDropout as ComponentDropout
 from gridreg.regularizers.dropout import component_dropout as component_dropout
 from gridreg.regularizers.filters import fourier_low_pass as fourier_low_pass
 from gridreg.regularizers.filters import gaussian_blur as gaussian_blur
+from gridreg.regularizers.frequency_masks import CosineMask as CosineMask
+from gridreg.regularizers.frequency_masks import FixedMask as FixedMask
+from gridreg.regularizers.frequency_masks import FrequencyMask as FrequencyMask
 from gridreg.regularizers.functions import GridFunction as GridFunction
 from gridreg.regularizers.functions import SamplesFunction as SamplesFunction
 from gridreg.regularizers.functions import from_function as from_function

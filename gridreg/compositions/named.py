@@ -9,7 +9,7 @@ from typing import Literal
 
 from gridreg.base import Regularizer
 from gridreg.errors import InputError, near_names
-from gridreg.regularizers.channel_masks import FixedMask, FrequencyMask
+from gridreg.regularizers.frequency_masks import FixedMask, FrequencyMask
 from gridreg.regularizers.grids import L1, Orthogonality
 from gridreg.regularizers.level_masks import ViewDependenceMask
 from gridreg.regularizers.low_pass import FourierLowPass, GridBlur

@@ -6,9 +6,9 @@ from gridreg.ops import use_backend as use_backend
 from gridreg.rendering.cameras import Camera as Camera
 from gridreg.rendering.cameras import Lens as Lens
 from gridreg.rendering.ensemble import Ensemble as Ensemble
+from gridreg.rendering.hull import visual_hull as visual_hull
 from gridreg.rendering.model import Model as Model
 from gridreg.rendering.occupancy import OccupancyGrid as OccupancyGrid
-from gridreg.rendering.occupancy import visual_hull as visual_hull
 from gridreg.rendering.rays import Rays as Rays
 from gridreg.rendering.rays import box_intersection as box_intersection
 from gridreg.rendering.rays import camera_rays as camera_rays
