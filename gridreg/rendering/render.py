@@ -13,7 +13,7 @@ from gridreg.rendering.occupancy import OccupancyGrid
 from gridreg.rendering.rays import Rays, box_intersection
 from gridreg.samples import RaySamples
 
-_BLOCK = 1 << 16
+_BLOCK = 1 << 13
 
 
 class Field(Protocol):
