@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import contextlib
 import math
+import os
+import signal
 import statistics
 import subprocess
 import sys
@@ -93,15 +95,15 @@ def powers_up_to(cores: int) -> list[int]:
 
 @contextlib.contextmanager
 def busy_loops(count: int) -> Iterator[None]:
-    """Other processes that want a processor each; they are a session of their own, as another user's would be."""
-    loop = [sys.executable, "-c", "while True: pass"]
-    running = [subprocess.Popen(loop, start_new_session=True) for _ in range(count)]
+    """Other processes that want a processor each; they are one session, as another user's would be."""
+    loop = f"import os\nfor _ in range({count - 1}):\n    if not os.fork():\n        break\nwhile True:\n    pass"
+    running = subprocess.Popen([sys.executable, "-c", loop], start_new_session=True) if count else None
     try:
         yield
     finally:
-        for process in running:
-            process.kill()
-            process.wait()
+        if running is not None:
+            os.killpg(running.pid, signal.SIGKILL)
+            running.wait()
 
 
 def exponent(rows: dict[str, Record]) -> float | None:
