@@ -42,7 +42,32 @@ def test_photographs_become_a_page(
     assert main(words) == 0
     assert "scene: is there already and is used as it is" in capsys.readouterr().out
     assert (out / "scene/transforms.json").stat().st_mtime_ns == before[0]
-    assert json.loads((out / "metrics.json").read_text())["steps"] == 6
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["steps"] == 6
+    # Of so few none is held out, and everything that shows the score says so.
+    assert (len(metrics["train_views"]), metrics["test_views"], metrics["trained_on"]) == (6, 1, 1)
+    assert "1 of 1 test views are trained on" in said.err
+    assert "mean of 1 test view (1 of them trained on)" in said.out
+    page = (out / "index.html").read_text()
+    assert "Views that were trained on" in page
+    assert "One view that was trained on" in page
+
+
+def test_photographs_are_held_out_where_that_is_wanted_or_there_are_enough(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    chosen = []
+    monkeypatch.setattr("gridreg.cli.train.run", lambda options: chosen.append(options.protocol) or 0)
+    scene = tmp_path / "out/scene"
+    assert main(["reconstruct", str(made / "photographs"), str(tmp_path / "out"), "--hold-out"]) == 0
+    content = json.loads((scene / "transforms.json").read_text())
+    for count in (23, 24):
+        frames = [dict(content["frames"][0], file_path=f"images/{i}.jpg") for i in range(count)]
+        for frame in frames:
+            (scene / frame["file_path"]).touch()
+        (scene / "transforms.json").write_text(json.dumps(content | {"frames": frames}))
+        assert main(["reconstruct", "unused", str(tmp_path / "out")]) == 0
+    assert chosen == ["holdout8", "all", "holdout8"]
 
 
 def test_bad_input_comes_before_the_work(

@@ -198,3 +198,14 @@ class TestFocus:
         np.testing.assert_allclose(focus_point(poses)[:2], [1.5, 0], atol=1e-9)
         with pytest.raises(InputError, match="look away"):
             camera_extent(poses, np.full((4, 4), 10.0), (10, 10))
+
+
+def test_frames_that_a_list_would_hold_out_are_trained_on_under_all_and_that_is_said(scene: Path) -> None:
+    held, every = load_scene(scene, "holdout8"), load_scene(scene, "all")
+    assert len(every.train) == len(held.train) + len(held.test)
+    assert {*every.train.names} == {*held.train.names, *held.test.names}
+    assert every.test.names == held.test.names
+    assert any(
+        f"{len(held.test)} of {len(held.test)} test views are trained on" in note for note in every.notes
+    )
+    assert not any("trained on" in note for note in held.notes)

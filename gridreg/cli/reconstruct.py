@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -11,6 +11,9 @@ import tyro
 
 from gridreg.cli.arguments import OptionalInt
 from gridreg.machine import DeviceName
+
+_ENOUGH = 24
+"""Photographs of which an eighth is not missed."""
 
 
 @dataclass
@@ -35,6 +38,8 @@ class ReconstructOptions:
     """Processor threads; default: all cores."""
     longest_edge: int = 800
     """Pixels; larger photographs are reduced to this once their cameras are known."""
+    hold_out: bool = False
+    """Keep every eighth photograph out of training, to score on it; of 24 photographs and more that is always done."""
     device: DeviceName = "cpu"
     """Where to compute; auto: a GPU where there is one."""
 
@@ -48,11 +53,13 @@ def run(options: ReconstructOptions) -> int:
     from gridreg.cli import train
     from gridreg.cli.runs import photographs_of
     from gridreg.scenes import prepare
+    from gridreg.scenes.load import read_folder
     from gridreg.training import TrainOptions, configure
     from gridreg.training.checkpoint import has_checkpoint
 
     scene = options.out / "scene"
     chosen = TrainOptions(
+        protocol="all",
         scene=scene,
         out=options.out,
         preset=options.preset,
@@ -77,4 +84,7 @@ def run(options: ReconstructOptions) -> int:
             progress=lambda stage: print(f"{stage} ...", file=sys.stderr, flush=True),
         )
         print(made, flush=True)
+    listed = read_folder(scene)
+    if options.hold_out or len(listed.train) + len(listed.test) >= _ENOUGH:
+        chosen = replace(chosen, protocol="holdout8")
     return train.run(chosen)

@@ -92,6 +92,7 @@ def write_page(
             doubts=_doubts(model, scene),
             next=beyond,
             max_deviation=MAX_DEVIATION,
+            trained_on=record.get("trained_on"),
             pairs=_pairs(places[0] / "test", record),
             chart=_chart(places),
             video=_video(places),
@@ -149,7 +150,7 @@ def _score(record: Mapping[str, Any]) -> tuple[list[tuple[str, str]], str]:
     shown += [("SSIM" if name == "ssim_gaussian" else name, f"{value:.4f}") for name, value in mean.items()]
     views, protocol = record.get("test_views"), record.get("protocol")
     what = "One view that was" if views == 1 else f"Mean of {views} views that were"
-    return shown, f"{what} not trained on, protocol {protocol}."
+    return shown, f"{what} {'' if record.get('trained_on') else 'not '}trained on, protocol {protocol}."
 
 
 def _pairs(folder: Path, record: Mapping[str, Any]) -> list[dict[str, Any]]:

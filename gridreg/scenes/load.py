@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from torch import Tensor
 from gridreg.errors import InputError
 from gridreg.scenes.blender import read_blender
 from gridreg.scenes.colmap import find_models, read_colmap
+from gridreg.scenes.doubts import doubts
 from gridreg.scenes.extent import Extent, blender_extent, check_box, points_extent, settled
 from gridreg.scenes.focus import focus_extent, surround_focus
 from gridreg.scenes.frames import Frame, SceneFiles
@@ -22,7 +24,7 @@ from gridreg.scenes.llff import read_llff
 from gridreg.scenes.protocols import VALIDATION_VIEWS, Protocol, Selection, get_protocol
 from gridreg.scenes.reader import OpenedFrames, ViewReader
 from gridreg.scenes.transforms import read_transforms
-from gridreg.scenes.views import IN_PLACE, Scene, Views, World, background_colour
+from gridreg.scenes.views import IN_PLACE, Scene, World, background_colour
 
 __all__ = [
     "BUILTIN_MARKER",
@@ -77,6 +79,8 @@ def load_scene(
     folder = Path(folder)
     protocol = get_protocol(protocol) if isinstance(protocol, str) else protocol
     files = read_folder(folder)
+    if not protocol.holds_out and files.split_here and not files.own_split:
+        files = replace(files, train=[*files.train, *files.test])
     by = f"protocol {protocol.name}"
     train_ids = _checked(_selected(protocol.train, files.train), files, "train", by)
     scored = files.test
@@ -124,7 +128,7 @@ def load_scene(
         validation=None if validation is None else others,
         ndc=files.ndc,
         world=world._replace(metric=files.metric),
-        notes=(*files.notes, *reader.notes, *_doubts(world, train, test_views)),
+        notes=(*files.notes, *reader.notes, *doubts(world, train, test_views)),
     )
     check_box(scene, files.points if given is not None else None)
     return scene
@@ -221,24 +225,6 @@ def _extent(
     # as the object is.
     stays = files.ndc or (not files.metric and (files.extent is not None or bounds is not None))
     return (IN_PLACE, extent) if stays else settled(extent)
-
-
-def _doubts(world: World, train: Views, test: Views) -> list[str]:
-    """Return what makes a score, or a place in the world, mean less than it seems."""
-    notes = []
-    if world != IN_PLACE:
-        place = ", ".join(f"{value:.6g}" for value in world.origin)
-        notes.append(
-            f"the world is centred on ({place}) and scaled: its unit is now {world.unit:.4g} of the files'"
-        )
-    for what, views in (("training", train), ("test", test)):
-        names = views.plain
-        if names:
-            notes.append(
-                f"{len(names)} of {len(views)} {what} images show nothing but one colour ({names[0]}, ...): "
-                "a high score on them means nothing"
-            )
-    return notes
 
 
 def _without(position: int, ids: tuple[int, ...], by: str) -> tuple[tuple[int, ...], tuple[int, ...]]:

@@ -175,6 +175,8 @@ class Protocol:
         validates: the scored views are `VALIDATION_VIEWS` training frames, evenly spread over those that are
             not trained on, instead of ``test``.
         leave: position among the training views of the one that is left out and scored instead of ``test``.
+        holds_out: whether frames that the reader would hold out of one list for testing are kept from training. If not,
+            they are scored all the same, which tells how well the field fits them and no more.
     """
 
     name: str
@@ -185,6 +187,7 @@ class Protocol:
     source: str
     validates: bool = False
     leave: int | None = None
+    holds_out: bool = True
 
 
 VALIDATION_VIEWS = 10
@@ -211,6 +214,9 @@ PROTOCOLS: dict[str, Protocol] = {
             "builtin8", First(8), Every(1), None, "white", "the built-in scene; not a published benchmark"
         ),
         Protocol("holdout8", Every(1), Every(1), None, "white", "own images and LLFF: every 8th held out"),
+        Protocol(
+            "all", Every(1), Every(1), None, "white", "own images, too few to hold any out", holds_out=False
+        ),
     )
 }
 """The protocols by name; :func:`get_protocol` knows the counted forms as well."""

@@ -15,6 +15,7 @@ import torch
 from gridreg.errors import InputError
 from gridreg.ops.compilation import work_clock
 from gridreg.scenes import Scene
+from gridreg.scenes.doubts import trained_on
 from gridreg.scenes.notebook import card
 from gridreg.training.checkpoint import has_checkpoint
 from gridreg.training.config import save_yaml
@@ -199,6 +200,7 @@ class Execution:
             command=command,
             train_views=scene.train.names,
             conventions={} if self.trainer.beside.exposure is None else AFFINE_CONVENTION,
+            trained_on=int(trained_on(scene.test, scene.train).sum()),
             uses_alpha=self.config.train.carve and scene.train.backdrop is None,
             device=str(self.trainer.bank.pixels.device),
         )

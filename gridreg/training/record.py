@@ -79,7 +79,9 @@ def summary(record: Mapping[str, Any]) -> str:
     """The mean of ``metrics_record`` in one line, with what it is the mean of."""
     mean = record["mean"]
     views = record["test_views"]
+    known = record.get("trained_on")
     return (
-        f"{record['scene']}, {record['protocol']}: mean of {views} test view{'s' if views != 1 else ''}: "
+        f"{record['scene']}, {record['protocol']}: mean of {views} test view{'s' if views != 1 else ''}"
+        f"{f' ({known} of them trained on)' if known else ''}: "
         f"PSNR {mean['psnr']:.2f} dB, SSIM {mean['ssim_gaussian']:.4f} (11x11 Gaussian)"
     )
