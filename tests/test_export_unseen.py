@@ -55,6 +55,17 @@ def test_box_that_is_seen_from_above_alone_is_solid_and_ends_where_it_is_seen_to
     np.testing.assert_allclose(mesh.vertices.max(axis=0), hollow.vertices.max(axis=0), atol=0.05)
 
 
+def test_what_stands_on_the_floor_of_the_box_reaches_down_to_it():
+    field = AnalyticField(lid)
+    mesh = extract_mesh(field, carved(field), resolution=49, cameras=around(35), standing=True)
+    assert_closed(mesh)
+    assert mesh.vertices[:, 2].min() == pytest.approx(-1.0, abs=0.05)
+    assert mesh.vertices[:, 2].max() == pytest.approx(0.4, abs=0.05)
+    # No camera sees through the foot, which narrows as they look past the edges of the box.
+    foot = mesh.vertices[mesh.vertices[:, 2] < -0.9]
+    assert np.abs(foot[:, :2]).max() < 0.45
+
+
 def test_bowl_that_cameras_look_into_stays_a_bowl():
     field = AnalyticField(bowl)
     before = extract_mesh(field, carved(field), resolution=49)

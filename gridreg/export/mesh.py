@@ -108,6 +108,7 @@ def extract_mesh(
     min_component: float = 0.01,
     fill_cavities: bool = True,
     cameras: Sequence[Camera] = (),
+    standing: bool = False,
     refine: int = 8,
     chunk: int = 1 << 18,
 ) -> Mesh:
@@ -130,6 +131,7 @@ def extract_mesh(
         cameras: that the field was trained on. Where they see nothing within the hull of their silhouettes, as under
             an object on a table, it is solid, in the colour of the nearest surface that they see; none, or no hull: as
             the field has it.
+        standing: whether the object is known to stand on the lower face (z) of the box, so that it reaches down to it.
         refine: bisection steps that move the vertices onto the level set.
         chunk: positions evaluated at once.
 
@@ -151,7 +153,7 @@ def extract_mesh(
     level = surface_threshold(volume) if threshold is None else threshold
     filled = None
     if len(cameras) and occupancy is not None and occupancy.hull is not None:
-        filled = fill_unseen(volume, level, cameras, occupancy)
+        filled = fill_unseen(volume, level, cameras, occupancy, standing=standing)
         np.maximum(volume.values, 2 * level * filled.values, out=volume.values)
 
     def inside_box(positions: Vertices) -> NDArray[np.float32]:

@@ -179,7 +179,8 @@ def write_mesh(
         field, occupancy = OnSheet(field, occupancy, world, base), None
     if crop is not None:
         options["bounds"] = _cropped(field.bounds, crop, world)
-    mesh = extract_mesh(field, occupancy, resolution=resolution, **options)
+    # Metres are known from the sheet that the object stands on.
+    mesh = extract_mesh(field, occupancy, resolution=resolution, standing=world.metric, **options)
     if faces is not None:
         mesh = mesh.reduced(faces)
     if texture is not None:

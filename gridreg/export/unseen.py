@@ -19,7 +19,12 @@ _SPLAT = 3
 
 
 def fill_unseen(
-    volume: DensityVolume, threshold: float, cameras: Sequence[Camera], occupancy: OccupancyGrid
+    volume: DensityVolume,
+    threshold: float,
+    cameras: Sequence[Camera],
+    occupancy: OccupancyGrid,
+    *,
+    standing: bool = False,
 ) -> DensityVolume:
     """Return how far each node is filled as no camera sees it, in [0, 1]: at 1/2 the filled space ends.
 
@@ -31,6 +36,7 @@ def fill_unseen(
         threshold: density per world unit at the surface.
         cameras: that the field was trained on, in its coordinates.
         occupancy: with the hull of their silhouettes.
+        standing: whether the object stands on what the lattice ends at below (z), so that it reaches down to there.
     """
     assert occupancy.hull is not None
     solid = volume.values >= threshold
@@ -52,6 +58,7 @@ def fill_unseen(
     if known.any():
         # Below what is seen at all, a hull only narrows as steeply as the lowest camera looks.
         low, high = surface[known].min(axis=0), surface[known].max(axis=0)
+        low[2] *= not standing
         unseen[tuple(left[((left >= low) & (left <= high)).all(axis=1)].T)] = True
     whole = unseen | solid
     # Slivers between two surfaces are no matter.
