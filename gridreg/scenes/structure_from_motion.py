@@ -30,9 +30,44 @@ def reconstruct(images: Path, out: Path) -> int:
     import pycolmap
 
     pycolmap.set_random_seed(0)
+    enough = _ENOUGH * sum(1 for path in images.rglob("*") if path.is_file())
+    best = None
+    for options in (_few_features(), pycolmap.FeatureExtractionOptions()):
+        place = out / f"features_{options.sift.max_num_features}"
+        place.mkdir()
+        found = _model(images, place, options, enough)
+        if found is not None and (best is None or found.num_reg_images() > best.num_reg_images()):
+            best = found
+        if best is not None and best.num_reg_images() >= enough:
+            break
+    if best is None:
+        return 0
+    (out / "model").mkdir()
+    best.write_binary(str(out / "model"))
+    return int(best.num_reg_images())
+
+
+def _few_features() -> Any:
+    """Options that take a third of the time and place the images of most sets; the others need all features."""
+    import pycolmap
+
+    options = pycolmap.FeatureExtractionOptions()
+    options.max_image_size = 1280
+    options.sift.max_num_features = 3072
+    # Images are not enlarged to find the smallest features.
+    options.sift.first_octave = 0
+    return options
+
+
+def _model(images: Path, out: Path, options: Any, enough: float) -> Any:
+    """The ``pycolmap.Reconstruction`` with the most images from features of these options, or None."""
+    import pycolmap
+
     database = out / "database.db"
     print(STAGES[0], flush=True)
-    pycolmap.extract_features(database, images, camera_mode=pycolmap.CameraMode.PER_FOLDER)
+    pycolmap.extract_features(
+        database, images, camera_mode=pycolmap.CameraMode.PER_FOLDER, extraction_options=options
+    )
     print(STAGES[1], flush=True)
     pycolmap.match_exhaustive(database)
     print(STAGES[2], flush=True)
@@ -41,16 +76,11 @@ def reconstruct(images: Path, out: Path) -> int:
     best = _largest_model(database, images, out / "kept_lens", adjust_lens=False)
     if best is not None:
         best = _refined(best, database, images, out)
-    count = sum(1 for path in images.rglob("*") if path.is_file())
-    if best is None or best.num_reg_images() < _ENOUGH * count:
+    if best is None or best.num_reg_images() < enough:
         free = _largest_model(database, images, out / "free_lens", adjust_lens=True)
         if free is not None and (best is None or free.num_reg_images() > best.num_reg_images()):
             best = free
-    if best is None:
-        return 0
-    (out / "model").mkdir()
-    best.write_binary(str(out / "model"))
-    return int(best.num_reg_images())
+    return best
 
 
 def _refined(model: Any, database: Path, images: Path, out: Path) -> Any:
