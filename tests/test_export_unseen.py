@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from gridreg.errors import InputError
 from gridreg.export.cameras import look_at
 from gridreg.export.mesh import extract_mesh
 from gridreg.rendering import Camera, Lens, OccupancyGrid
@@ -83,6 +84,12 @@ def test_nothing_is_filled_without_silhouettes_or_outside_their_hull():
     walls = (~((centres[..., :2].abs() < 0.45).all(dim=-1) & (centres[..., 2] < 0.25))).to(torch.uint8)
     proven = OccupancyGrid(grid.bounds, grid.cells, walls)
     assert extract_mesh(field, proven, resolution=33, cameras=around(35)).volume < 0.7 * SOLID
+
+
+def test_threshold_that_nothing_exceeds_is_refused_with_cameras_too():
+    field = AnalyticField(lid)
+    with pytest.raises(InputError, match="expected a threshold below it"):
+        extract_mesh(field, carved(field), resolution=17, cameras=around(35), threshold=1e4)
 
 
 def test_filled_surfaces_have_the_colour_of_what_is_seen_beside_them():

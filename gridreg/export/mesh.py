@@ -120,7 +120,7 @@ def extract_mesh(
         field: the field; what is attached to it counts.
         occupancy: density counts only in occupied cells, as in renders; None: everywhere.
         resolution: lattice nodes along the longest edge of the box. Memory grows with its cube: about 20
-            bytes per node, 350 MB at 256.
+            bytes per node, 350 MB at 256; 36 with cameras.
         threshold: density per world unit at the surface; None: from the field, see
             `gridreg.export.volume.surface_threshold`.
         bounds: ``(2, 3)`` box to look in, world units; None: that of the field.
@@ -147,7 +147,9 @@ def extract_mesh(
     box = field.bounds if bounds is None else bounds.to(field.bounds)
     edges = (box[1] - box[0]).double()
     nodes = resolution**3 * float((edges / edges.max()).prod())
-    check_memory(20 * nodes, f"resolution={resolution}: a lattice of {nodes:.3g} nodes")
+    check_memory(
+        (36 if len(cameras) else 20) * nodes, f"resolution={resolution}: a lattice of {nodes:.3g} nodes"
+    )
     density = SeenDensity(field, occupancy, chunk)
     volume = sample_density(density, box, resolution)
     level = surface_threshold(volume) if threshold is None else threshold

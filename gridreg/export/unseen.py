@@ -46,20 +46,27 @@ def fill_unseen(
     def place(index: NDArray[np.int64]) -> NDArray[np.float64]:
         return np.asarray(volume.lower + index * volume.spacing)
 
-    surface = np.argwhere(solid & ~ndimage.binary_erosion(solid, border_value=1))
-    known = np.zeros(len(surface), dtype=bool)
-    left = np.argwhere(~solid)
-    left = left[hull.contains(torch.from_numpy(place(left)).to(hull.bounds)).cpu().numpy()]
-    for camera in cameras:
-        past = _view(place(surface), camera, spacing)
-        known |= past(place(surface))
-        left = left[~past(place(left))]
+    index = np.argwhere(solid & ~ndimage.binary_erosion(solid, border_value=1))
+    surface = place(index)
+    views = [_view(surface, camera, spacing) for camera in cameras if len(surface)]
+    known = np.zeros(len(index), dtype=bool)
+    for sees in views:
+        known |= sees(surface)
     unseen = np.zeros_like(solid)
     if known.any():
         # Below what is seen at all, a hull only narrows as steeply as the lowest camera looks.
-        low, high = surface[known].min(axis=0), surface[known].max(axis=0)
+        low, high = index[known].min(axis=0), index[known].max(axis=0)
         low[2] *= not standing
-        unseen[tuple(left[((left >= low) & (left <= high)).all(axis=1)].T)] = True
+        for i in range(low[0], high[0] + 1):
+            # A layer at a time: positions of all nodes would take more memory than the lattice.
+            nodes = np.insert(
+                np.argwhere(~solid[i, low[1] : high[1] + 1, low[2] : high[2] + 1]), 0, 0, axis=1
+            )
+            nodes += (i, low[1], low[2])
+            nodes = nodes[hull.contains(torch.from_numpy(place(nodes)).to(hull.bounds)).cpu().numpy()]
+            for sees in views:
+                nodes = nodes[~sees(place(nodes))]
+            unseen[tuple(nodes.T)] = True
     whole = unseen | solid
     # Slivers between two surfaces are no matter.
     unseen &= ndimage.binary_opening(whole, np.ones((3, 3, 3), dtype=bool))
