@@ -16,6 +16,7 @@ from gridreg.machine import choose_device
 from gridreg.ops import use_backend
 from gridreg.rendering import Camera, Lens
 from gridreg.scenes import Scene, builtin_scene, load_scene
+from gridreg.scenes.doubts import trained_on
 from gridreg.training import RunConfig, TrainSettings, build_trainer, load_run, resume_trainer, save_run
 from gridreg.training.presets import load_preset
 from tests.fake_device import DEVICE, FakeDevice
@@ -84,6 +85,14 @@ def config_of(backbone: str) -> RunConfig:
     if backbone == "mlp":  # counts as 128 cells across
         train = replace(train, step_ratio=16.0, rays=8)
     return RunConfig(backbone=backbone, field=small, train=train, composition=gridreg.to_config(composition))
+
+
+def test_views_that_are_trained_on_are_counted_where_scenes_are_split_over_devices(
+    scene: Scene, device: torch.device
+) -> None:
+    there = scene.to(device)
+    assert trained_on(there.test, there.train) == 0
+    assert trained_on(scene.train, there.train) == len(scene.train)
 
 
 @pytest.mark.parametrize("backbone", ["vm", "cp", "mlp"])

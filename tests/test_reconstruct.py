@@ -48,9 +48,12 @@ def test_photographs_become_a_page(
     assert (len(metrics["train_views"]), metrics["test_views"], metrics["trained_on"]) == (6, 1, 1)
     assert "1 of 1 test views are trained on" in said.err
     assert "mean of 1 test view (1 of them trained on)" in said.out
-    page = (out / "index.html").read_text()
-    assert "Views that were trained on" in page
-    assert "One view that was trained on" in page
+    assert main(["eval", str(out), "--out", str(tmp_path / "again")]) == 0
+    assert "mean of 1 test view (1 of them trained on)" in capsys.readouterr().out
+    for folder in (out, tmp_path / "again"):
+        page = (folder / "index.html").read_text()
+        assert "Views that were trained on" in page
+        assert "One view that was trained on" in page
 
 
 def test_photographs_are_held_out_where_that_is_wanted_or_there_are_enough(

@@ -45,6 +45,7 @@ def _score(options: EvalOptions) -> int:
     from gridreg.cli.runs import folder_of, scene_of
     from gridreg.export import write_page
     from gridreg.ops.compilation import work_clock
+    from gridreg.scenes.doubts import trained_on
     from gridreg.training import load_run
     from gridreg.training.evaluate import Scored, score_views
     from gridreg.training.exposure import AFFINE_CONVENTION, affine_psnr
@@ -89,6 +90,7 @@ def _score(options: EvalOptions) -> int:
         uses_alpha=scene.train.backdrop is None
         and any(run.config.train.carve for run in loaded.members or (loaded,)),
         conventions=conventions,
+        trained_on=trained_on(scene.test, scene.train),
         **({"members": members} if members else {}),
     )
     if options.out is not None:

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
 
 from gridreg.scenes.views import IN_PLACE, Views, World
 
 
-def trained_on(views: Views, train: Views) -> Tensor:
-    """Return which views show what a training view shows, from the same place, ``(V,)`` bool."""
-    found = torch.zeros(len(views), dtype=torch.bool)
-    for number, pose in enumerate(views.poses):
-        same = (train.poses == pose).flatten(1).all(dim=1).nonzero().flatten().tolist()
-        found[number] = any(torch.equal(train.pixels[i], views.pixels[number]) for i in same)
-    return found
+def trained_on(views: Views, train: Views) -> int:
+    """Return how many views show what a training view shows, from the same place."""
+    count = 0
+    # The views to score stay where they are when a scene goes to another device.
+    poses = train.poses.to(views.poses.device)
+    for pose, pixels in zip(views.poses, views.pixels, strict=True):
+        same = (poses == pose).flatten(1).all(dim=1).nonzero().flatten().tolist()
+        count += any(torch.equal(train.pixels[i].to(pixels.device), pixels) for i in same)
+    return count
 
 
 def doubts(world: World, train: Views, test: Views) -> list[str]:
@@ -25,7 +26,7 @@ def doubts(world: World, train: Views, test: Views) -> list[str]:
         notes.append(
             f"the world is centred on ({place}) and scaled: its unit is now {world.unit:.4g} of the files'"
         )
-    fitted = int(trained_on(test, train).sum())
+    fitted = trained_on(test, train)
     if fitted:
         notes.append(
             f"{fitted} of {len(test)} test views are trained on: a score on them tells how well they are fitted, "

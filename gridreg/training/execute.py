@@ -200,7 +200,7 @@ class Execution:
             command=command,
             train_views=scene.train.names,
             conventions={} if self.trainer.beside.exposure is None else AFFINE_CONVENTION,
-            trained_on=int(trained_on(scene.test, scene.train).sum()),
+            trained_on=trained_on(scene.test, scene.train),
             uses_alpha=self.config.train.carve and scene.train.backdrop is None,
             device=str(self.trainer.bank.pixels.device),
         )
