@@ -92,6 +92,13 @@ def test_members_have_nothing_outside_their_cells_and_boxes():
     cells = field.occupancy()
     assert cells.resolution == (4, 4, 4)
     assert cells.contains(x).tolist() == [True, True, True, True, False]
+    assert cells.hull is None
+    # What silhouettes leave of the members counts if all of them have it.
+    for one in field.occupancies:
+        one.hull = one.cells.clone()
+    hull = field.occupancy().hull
+    assert hull is not None
+    assert torch.equal(hull, cells.cells)
 
 
 def test_gradients_reach_every_member():

@@ -61,8 +61,13 @@ class Ensemble(nn.Module):
     def occupancy(self) -> OccupancyGrid:
         """Cells of the common box in which any member may have something, as many along each axis as any member has."""
         x, y, z = (max(sizes) for sizes in zip(*(one.resolution for one in self.occupancies), strict=True))
-        cells = [one.at(self.bounds, (x, y, z)).cells for one in self.occupancies]
-        return OccupancyGrid(self.bounds.clone(), torch.stack(cells).amax(0))
+        placed = [one.at(self.bounds, (x, y, z)) for one in self.occupancies]
+        hulls = [one.hull for one in placed if one.hull is not None]
+        return OccupancyGrid(
+            self.bounds.clone(),
+            torch.stack([one.cells for one in placed]).amax(0),
+            torch.stack(hulls).amax(0) if len(hulls) == len(placed) else None,
+        )
 
     def density(self, x: Tensor) -> Tensor:
         """Positions ``(N, 3)`` to densities ``(N,)`` per world unit."""
