@@ -27,7 +27,6 @@ from stored import Record
 
 from gridreg.cli import run_cli
 from gridreg.errors import InputError
-from gridreg.rendering import Camera, Lens
 from gridreg.scenes import Scene, load_scene
 from gridreg.training import LoadedRun, load_run
 from gridreg.training.evaluate import score_views
@@ -112,10 +111,7 @@ def deviation_record(joined: LoadedRun, scene: Scene) -> Record:
     """Return the rank correlations of the members' deviation with the true error of their mean."""
     views, pixels, everywhere, means = scene.test, {}, {}, []
     targets = views.composited(joined.background)
-    for i, (pose, intrinsics, name) in enumerate(
-        zip(views.poses, views.intrinsics, views.names, strict=True)
-    ):
-        camera = Camera(pose, Lens.from_tensor(intrinsics, views.height, views.width))
+    for i, (camera, name) in enumerate(zip(views.cameras, views.names, strict=True)):
         rendered = joined.render(camera, deviation=True)
         assert rendered is not None
         assert rendered.deviation is not None

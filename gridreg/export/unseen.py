@@ -59,9 +59,7 @@ def fill_unseen(
         low[2] *= not standing
         for i in range(low[0], high[0] + 1):
             # A layer at a time: positions of all nodes would take more memory than the lattice.
-            nodes = np.insert(
-                np.argwhere(~solid[i, low[1] : high[1] + 1, low[2] : high[2] + 1]), 0, 0, axis=1
-            )
+            nodes = np.argwhere(~solid[i : i + 1, low[1] : high[1] + 1, low[2] : high[2] + 1])
             nodes += (i, low[1], low[2])
             nodes = nodes[hull.contains(torch.from_numpy(place(nodes)).to(hull.bounds)).cpu().numpy()]
             for sees in views:

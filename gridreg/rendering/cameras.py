@@ -70,3 +70,11 @@ class Camera:
 
     pose: Tensor
     lens: Lens
+
+
+def cameras_of(poses: Tensor, intrinsics: Tensor, height: int, width: int) -> tuple[Camera, ...]:
+    """Return cameras of poses ``(V, 4, 4)`` and intrinsics ``(V, 4)``, with images of one size."""
+    return tuple(
+        Camera(pose, Lens.from_tensor(lens, height, width))
+        for pose, lens in zip(poses, intrinsics, strict=True)
+    )

@@ -35,9 +35,7 @@ def reconstruct(images: Path, out: Path) -> int:
     for options in (_few_features(), pycolmap.FeatureExtractionOptions()):
         place = out / f"features_{options.sift.max_num_features}"
         place.mkdir()
-        found = _model(images, place, options, enough)
-        if found is not None and (best is None or found.num_reg_images() > best.num_reg_images()):
-            best = found
+        best = _larger(best, _model(images, place, options, enough))
         if best is not None and best.num_reg_images() >= enough:
             break
     if best is None:
@@ -77,10 +75,14 @@ def _model(images: Path, out: Path, options: Any, enough: float) -> Any:
     if best is not None:
         best = _refined(best, database, images, out)
     if best is None or best.num_reg_images() < enough:
-        free = _largest_model(database, images, out / "free_lens", adjust_lens=True)
-        if free is not None and (best is None or free.num_reg_images() > best.num_reg_images()):
-            best = free
+        best = _larger(best, _largest_model(database, images, out / "free_lens", adjust_lens=True))
     return best
+
+
+def _larger(*models: Any) -> Any:
+    """The one of several models with the most images, the first of equals; each may be None."""
+    found = (model for model in models if model is not None)
+    return max(found, key=lambda model: model.num_reg_images(), default=None)
 
 
 def _refined(model: Any, database: Path, images: Path, out: Path) -> Any:
@@ -112,7 +114,7 @@ def _largest_model(database: Path, images: Path, out: Path, *, adjust_lens: bool
     models = pycolmap.incremental_mapping(
         database, images, out, options, next_image_callback=lambda: print("placed", next(placed), flush=True)
     )
-    return max(models.values(), key=lambda model: model.num_reg_images(), default=None)
+    return _larger(*models.values())
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gridreg.errors import InputError
-from gridreg.rendering import Camera, Lens
+from gridreg.rendering.cameras import Camera, cameras_of
 from gridreg.scenes.gate import check_cameras, check_extent
 from gridreg.scenes.notebook import card, thumbnails
 from gridreg.scenes.pixels import as_floats
@@ -141,10 +141,7 @@ class Views:
     @property
     def cameras(self) -> tuple[Camera, ...]:
         """The camera of each image."""
-        return tuple(
-            Camera(pose, Lens.from_tensor(lens, self.height, self.width))
-            for pose, lens in zip(self.poses, self.intrinsics, strict=True)
-        )
+        return cameras_of(self.poses, self.intrinsics, self.height, self.width)
 
     @property
     def rgba(self) -> Tensor:

@@ -14,14 +14,13 @@ import gridreg
 from gridreg.errors import InputError
 from gridreg.fields import import_modules, make_field
 from gridreg.rendering import (
-    Camera,
     Ensemble,
     JoinedSurroundings,
-    Lens,
     Model,
     OccupancyGrid,
     Surroundings,
 )
+from gridreg.rendering.cameras import Camera, cameras_of
 from gridreg.scenes import IN_PLACE, World
 from gridreg.scenes.gate import check_extent
 from gridreg.scenes.notebook import card
@@ -182,13 +181,10 @@ def _run(
 def _saved_cameras(saved: dict[str, Any] | None) -> tuple[Camera, ...]:
     if saved is None:
         return ()
-    poses, lenses = saved["poses"].float(), saved["intrinsics"]
-    size = int(saved["height"]), int(saved["width"])
+    poses = saved["poses"].float()
     if poses.shape[1:] != (4, 4) or not bool(torch.isfinite(poses).all()):
         raise ValueError("poses of the training views are not (V, 4, 4) finite numbers")
-    return tuple(
-        Camera(pose, Lens.from_tensor(lens, *size)) for pose, lens in zip(poses, lenses, strict=True)
-    )
+    return cameras_of(poses, saved["intrinsics"], int(saved["height"]), int(saved["width"]))
 
 
 def _saved_world(saved: dict[str, Any] | None) -> World:
